@@ -1,0 +1,1 @@
+"""Frames, nodes, the emulated medium and the loops that carry frames between nodes."""

@@ -1,0 +1,101 @@
+"""The CAN frame, as it is queued, carried and traced.
+
+Source: ISO 11898-1. Classical frames are complete; the FD flags are carried but the emulated medium refuses them.
+"""
+
+from typing import Final, final
+
+from canopen_exo.bus.bits import frame_bits
+from canopen_exo.errors import CanopenExoError
+
+FLAG_EXTENDED: Final = 1
+FLAG_REMOTE: Final = 2
+FLAG_FD: Final = 4
+FLAG_BRS: Final = 8
+FLAG_ESI: Final = 16
+
+_FD_SIZES: Final = (12, 16, 20, 24, 32, 48, 64)
+
+
+@final
+class Frame:
+    """One CAN frame; never changed after it is made.
+
+    can_id: 11-bit, or 29-bit with FLAG_EXTENDED. data: 0..8 bytes (up to 64 with FLAG_FD), empty for a remote frame.
+    flags: the FLAG_ constants. dlc: as on the wire; equals len(data) unless given (remote frames, raw DLC 9..15).
+    arbitration: the bits that compete for the bus, as one integer; the lower one wins.
+    """
+
+    __slots__ = ("_bits", "arbitration", "can_id", "data", "dlc", "flags")
+
+    def __init__(self, can_id: int, data: bytes, flags: int = 0, dlc: int = -1) -> None:
+        self.can_id: Final[int] = can_id
+        self.data: Final[bytes] = data
+        self.flags: Final[int] = flags
+        if flags == 0 and dlc < 0:  # the frames of nearly every cycle
+            if can_id < 0 or can_id > 0x7FF or len(data) > 8:
+                check_frame(can_id, data, flags, dlc)
+            self.dlc: Final[int] = len(data)
+            self.arbitration: Final[int] = can_id << 21
+        else:
+            check_frame(can_id, data, flags, dlc)
+            self.dlc = dlc if dlc >= 0 else _wire_dlc(len(data))
+            remote = 1 if flags & FLAG_REMOTE else 0
+            if flags & FLAG_EXTENDED:  # ID28-18, SRR 1, IDE 1, ID17-0, RTR
+                self.arbitration = (can_id >> 18) << 21 | 3 << 19 | (can_id & 0x3FFFF) << 1 | remote
+            else:  # ID, RTR, IDE 0
+                self.arbitration = can_id << 21 | remote << 20
+        self._bits: int = 0
+
+    @property
+    def bits(self) -> int:
+        """Length on the wire in bits, stuffing and 3-bit intermission included; worked out once."""
+        if self._bits == 0:
+            self._bits = frame_bits(
+                self.can_id, self.data, self.flags & FLAG_EXTENDED != 0, self.flags & FLAG_REMOTE != 0, self.dlc
+            )
+        return self._bits
+
+    def with_data(self, data: bytes) -> "Frame":
+        """The same frame with another payload of the same length."""
+        return Frame(self.can_id, data, self.flags, self.dlc if self.flags else -1)
+
+    def __eq__(self, other: object) -> bool:
+        return (
+            isinstance(other, Frame)
+            and self.can_id == other.can_id
+            and self.data == other.data
+            and self.flags == other.flags
+            and self.dlc == other.dlc
+        )
+
+    def __hash__(self) -> int:
+        return hash((self.can_id, self.data, self.flags, self.dlc))
+
+    def __reduce__(self) -> tuple[type["Frame"], tuple[int, bytes, int, int]]:
+        return Frame, (self.can_id, self.data, self.flags, self.dlc)
+
+    def __repr__(self) -> str:
+        width = 8 if self.flags & FLAG_EXTENDED else 3
+        return f"{self.can_id:0{width}X}#{'R' if self.flags & FLAG_REMOTE else self.data.hex().upper()}"
+
+
+def _wire_dlc(size: int) -> int:
+    return size if size <= 8 else 9 + _FD_SIZES.index(size)
+
+
+def check_frame(can_id: int, data: bytes, flags: int, dlc: int) -> None:
+    """Raise CanopenExoError when the parts do not make a CAN frame."""
+    top = 0x1FFFFFFF if flags & FLAG_EXTENDED else 0x7FF
+    if not 0 <= can_id <= top:
+        raise CanopenExoError(f"frame: CAN id {can_id:#x} given, allowed 0..{top:#x}; use FLAG_EXTENDED for 29-bit ids")
+    if flags & FLAG_FD:
+        if len(data) > 8 and len(data) not in _FD_SIZES:
+            raise CanopenExoError(f"frame: {len(data)} data bytes given, a CAN FD frame has 0..8 or one of {_FD_SIZES}")
+        return
+    if len(data) > 8:
+        raise CanopenExoError(f"frame: {len(data)} data bytes given, a classical frame has 0..8; FLAG_FD allows 64")
+    if flags & FLAG_REMOTE and data:
+        raise CanopenExoError("frame: a remote frame carries no data; give its length as dlc")
+    if dlc > 15 or (dlc >= 0 and not flags & FLAG_REMOTE and min(dlc, 8) != len(data)):
+        raise CanopenExoError(f"frame: dlc {dlc} given with {len(data)} data bytes; allowed {len(data)} (9..15 with 8)")

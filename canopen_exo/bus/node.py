@@ -1,0 +1,87 @@
+"""The one interface between a loop and what is connected to a bus.
+
+Cores receive `now` as an argument and never read a clock; all times are integer nanoseconds on the loop's clock.
+Source: ISO 11898-1 (node, error states); the pull-style timer is this project's (`wake_at` is read before every wait).
+"""
+
+from enum import Enum
+from typing import Final, final
+
+from mypy_extensions import mypyc_attr
+
+from canopen_exo.bus.frame import Frame
+
+NEVER: Final = 1 << 61
+"""A `wake_at` that never comes."""
+
+MS: Final = 1_000_000
+"""One millisecond in nanoseconds."""
+
+SECOND: Final = 1_000_000_000
+"""One second in nanoseconds."""
+
+
+class ErrorState(Enum):
+    """State of a CAN controller (ISO 11898-1, fault confinement), and what a driver adds to it."""
+
+    ERROR_ACTIVE = "error_active"
+    WARNING = "warning"
+    ERROR_PASSIVE = "error_passive"
+    BUS_OFF = "bus_off"
+    DOWN = "down"
+
+
+@final
+class PortState:
+    """The only error notice to Nodes: the new state of a port with its counters and why it changed."""
+
+    __slots__ = ("cause", "port", "rec", "state", "tec")
+
+    def __init__(self, port: int, state: ErrorState, tec: int, rec: int, cause: str) -> None:
+        self.port: Final[int] = port
+        self.state: Final[ErrorState] = state
+        self.tec: Final[int] = tec
+        self.rec: Final[int] = rec
+        self.cause: Final[str] = cause
+
+
+@mypyc_attr(allow_interpreted_subclasses=True)
+class Out:
+    """What a node sends through: `send(port, frame)` puts a frame into that port's transmit queue."""
+
+    def send(self, port: int, frame: Frame) -> None:
+        """Queue `frame` on `port`; a full queue drops the newest frame and counts it."""
+        raise NotImplementedError
+
+
+@mypyc_attr(allow_interpreted_subclasses=True)
+class Node:
+    """Something on a bus: a controller, a device, a rack of devices, a gateway.
+
+    wake_at: absolute time [ns] of the next call to `wake`, NEVER for none; read afresh before every wait.
+    """
+
+    def __init__(self) -> None:
+        self.wake_at: int = NEVER
+
+    def receive(self, now: int, port: int, frame: Frame, out: Out) -> None:
+        """A frame ended at `now` on `port`. Must not raise whatever its bytes."""
+
+    def wake(self, now: int, out: Out) -> None:
+        """`wake_at` is reached; `now` is that time. Must move `wake_at` on."""
+
+    def port_changed(self, now: int, state: PortState, out: Out) -> None:
+        """A port changed its error state."""
+
+
+@final
+class PortOut(Out):
+    """Sends on one fixed port of another Out, for a part that knows only its own port 0."""
+
+    def __init__(self, out: Out, port: int) -> None:
+        self.out = out
+        self.port: Final[int] = port
+
+    def send(self, port: int, frame: Frame) -> None:
+        """Queue `frame` on the fixed port."""
+        self.out.send(self.port, frame)
