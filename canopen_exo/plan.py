@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from canopen_exo.errors import CanopenExoError
-from canopen_exo.signal import Signal
+from canopen_exo.signal import Codec, Signal, compile_codec
 
 NMT: Final = 0x000
 SYNC: Final = 0x080
@@ -65,6 +65,18 @@ class Pdo:
     base: int
     every: int
     content: tuple[Mapped, ...]
+
+    def codec(self) -> Codec:
+        """Packs and unpacks the raw values of the content, in order."""
+        return compile_codec([(mapped.length, mapped.signed) for mapped in self.content])
+
+    def place(self, name: str) -> int:
+        """Place of an object in the content; raises CanopenExoError naming what there is."""
+        for at, mapped in enumerate(self.content):
+            if mapped.name == name:
+                return at
+        names = ", ".join(mapped.name for mapped in self.content)
+        raise CanopenExoError(f"bus plan: {self.name} carries no {name!r}; it carries {names}")
 
 
 PDOS: Final = (
@@ -123,6 +135,13 @@ class BusPlan:
         raise CanopenExoError(
             f"unknown joint {name!r}; this rig has {', '.join(joint.name for joint in self.joints)}"
         )
+
+    def pdo(self, name: str) -> Pdo:
+        """The PDO of that name; raises CanopenExoError naming the ones there are."""
+        for pdo in self.pdos:
+            if pdo.name == name:
+                return pdo
+        raise CanopenExoError(f"bus plan: no PDO {name!r}; there are {', '.join(pdo.name for pdo in self.pdos)}")
 
     def load(self) -> tuple[float, float]:
         """Share of the bit rate used in steady motion: (no stuff bits, every frame worst-stuffed)."""

@@ -1,0 +1,1 @@
+"""Data only: the EDS files, the source of the object dictionaries."""

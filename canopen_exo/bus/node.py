@@ -73,15 +73,3 @@ class Node:
     def port_changed(self, now: int, state: PortState, out: Out) -> None:
         """A port changed its error state."""
 
-
-@final
-class PortOut(Out):
-    """Sends on one fixed port of another Out, for a part that knows only its own port 0."""
-
-    def __init__(self, out: Out, port: int) -> None:
-        self.out = out
-        self.port: Final[int] = port
-
-    def send(self, port: int, frame: Frame) -> None:
-        """Queue `frame` on the fixed port."""
-        self.out.send(self.port, frame)

@@ -1,0 +1,381 @@
+"""A CANopen device: the state machines of CiA 301 put together around one object dictionary.
+
+Source: CiA 301, 7.3.2.2 (services per NMT state, table 38). What the device is for (a drive) is its Application.
+Leaves out: LSS, node guarding, block SDO, TIME, store and restore.
+"""
+
+from typing import Final, final
+
+from mypy_extensions import mypyc_attr
+
+from canopen_exo.bus.frame import FLAG_EXTENDED, FLAG_FD, FLAG_REMOTE, Frame
+from canopen_exo.bus.node import MS, NEVER, Node, Out
+from canopen_exo.emcy import COMMUNICATION_BIT, HEARTBEAT_LOST, RPDO_TIMEOUT, SYNC_LENGTH, SYNC_LOST, EmcyProducer
+from canopen_exo.heartbeat import HeartbeatConsumer, HeartbeatProducer, heartbeat_frame
+from canopen_exo.nmt import NmtCommand, NmtSlave, NmtState, decode_nmt
+from canopen_exo.od import ObjectDictionary, WriteObserver
+from canopen_exo.pdo import INVALID, PDO_COUNT, ReceivePdo, TransmitPdo, key_of, mapping_abort
+from canopen_exo.plan import HEARTBEAT, SDO_ANSWER, SDO_REQUEST, SYNC
+from canopen_exo.sdo import SdoServer
+from canopen_exo.sync import SyncConsumer
+
+BOOT_NS: Final = 5 * MS
+"""Time from reset to the boot-up message (assumed)."""
+
+SYNC_LOSS_CYCLES: Final = 5
+"""SYNC periods (0x1006) of silence after which SYNC counts as lost (this project's drives)."""
+
+ABORT_DEVICE_STATE: Final = 0x08000022
+ABORT_INCOMPATIBLE: Final = 0x06040043
+ABORT_VALUE_RANGE: Final = 0x06090030
+
+ERROR_REGISTER: Final = key_of(0x1001, 0)
+
+
+@mypyc_attr(allow_interpreted_subclasses=True)
+class Application(WriteObserver):
+    """What a device does beyond communication; `check` and `written` see every SDO write to its objects."""
+
+    def reset(self, now: int) -> None:
+        """Power-up or NMT reset: start from the object dictionary's defaults."""
+
+    def applied(self, now: int) -> None:
+        """Process data reached the object dictionary (with SYNC, or at once)."""
+
+    def latch(self, now: int) -> None:
+        """SYNC: put the present inputs into the object dictionary, before the transmit PDOs read them."""
+
+    def left_operational(self, now: int) -> None:
+        """The device is no longer Operational: process data no longer comes."""
+
+    def communication_lost(self, now: int, code: int) -> None:
+        """A communication error (EMCY code) that the device must react to; object 0x6007 says how."""
+
+    def can_clear(self, code: int) -> bool:
+        """Whether an error may be reported as gone now."""
+        return True
+
+
+@final
+class Device(Node):
+    """One CANopen device on its port 0. Serves everything by `receive` and `wake`; never raises on received bytes.
+
+    port: the port it sends on (a rack of devices gives each its own). malformed: NMT messages of a wrong length.
+    revision: counts changes of what it listens to.
+    """
+
+    def __init__(self, od: ObjectDictionary, node_id: int, application: Application, port: int = 0) -> None:
+        super().__init__()
+        self.port: Final[int] = port
+        self.revision: int = 0
+        self.now: int = 0
+        self.od: Final[ObjectDictionary] = od
+        self.node_id: Final[int] = node_id
+        self.application: Final[Application] = application
+        self.nmt: NmtSlave = NmtSlave()
+        self.sdo: SdoServer = SdoServer(od, node_id)
+        self.emcy: Final[EmcyProducer] = EmcyProducer(node_id)
+        self.heartbeat: Final[HeartbeatProducer] = HeartbeatProducer(node_id)
+        self.tpdos: list[TransmitPdo] = []
+        self.rpdos: list[ReceivePdo] = []
+        self.rpdo_by_id: dict[int, ReceivePdo] = {}
+        self.consumers: list[HeartbeatConsumer] = []
+        self.sync_consumer: SyncConsumer = SyncConsumer(0, 0)
+        self.operational: bool = False
+        self.malformed: int = 0
+        self.boot_at: int = 0
+        self.wake_at = 0
+        od.observer = _Rules(self)
+        self._reset(0, NmtCommand.RESET_NODE)
+
+    # --- receiving -----------------------------------------------------------------------------------------------
+
+    def cob_ids(self) -> list[int]:
+        """Ids this device listens to at present: NMT, SYNC, SDO request, RPDOs, consumed heartbeats."""
+        ids = [0, SYNC, SDO_REQUEST + self.node_id, *self.rpdo_by_id]
+        for consumer in self.consumers:
+            ids.append(HEARTBEAT + consumer.node_id)
+        return ids
+
+    def receive(self, now: int, port: int, frame: Frame, out: Out) -> None:
+        """Any frame of the bus."""
+        if frame.flags & (FLAG_EXTENDED | FLAG_REMOTE | FLAG_FD):
+            return
+        can_id, data = frame.can_id, frame.data
+        if can_id == SYNC:
+            self._sync(now, data, out)
+            return
+        rpdo = self.rpdo_by_id.get(can_id)
+        if rpdo is not None:
+            self._process_data(now, rpdo, data, out)
+            return
+        self.now = now
+        if self.nmt.state is NmtState.INITIALISING:
+            return
+        if can_id == SDO_REQUEST + self.node_id:
+            if self.nmt.state is not NmtState.STOPPED:
+                answer = self.sdo.request(now, data)
+                if answer is not None:
+                    out.send(self.port, Frame(SDO_ANSWER + self.node_id, answer))
+        elif can_id == 0:
+            self._command(now, data, out)
+        elif can_id >= HEARTBEAT:
+            for consumer in self.consumers:
+                if consumer.node_id == can_id - HEARTBEAT and consumer.received(now, data):
+                    self._vanished(HEARTBEAT_LOST)
+        self._send_emcy(now, out)
+        self._plan_wake()
+
+    def _sync(self, now: int, data: bytes, out: Out) -> None:
+        """SYNC: apply what pends, latch, send the PDOs that are due."""
+        if not self.operational:
+            return
+        consumer = self.sync_consumer
+        if consumer.lost:
+            self._vanished(SYNC_LOST)
+        if not consumer.received(now, data):
+            self.emcy.report(SYNC_LENGTH)
+            self._send_emcy(now, out)
+            self._plan_wake()
+            return
+        applied = False
+        for rpdo in self.rpdos:
+            if rpdo.pending is not None and rpdo.apply(self.od):
+                applied = True
+        application = self.application
+        if applied:
+            application.applied(now)
+        application.latch(now)
+        counter = data[0] if data else 0
+        values = self.od.values
+        for tpdo in self.tpdos:
+            if tpdo.active and tpdo.on_sync(counter):
+                out.send(self.port, tpdo.frame(values))
+        if consumer.deadline < self.wake_at:
+            self.wake_at = consumer.deadline
+
+    def _process_data(self, now: int, rpdo: ReceivePdo, data: bytes, out: Out) -> None:
+        """An RPDO came."""
+        if not self.operational:
+            return
+        code = rpdo.received(now, data)
+        if code:
+            self.emcy.report(code)
+            self._send_emcy(now, out)
+        if rpdo.late and rpdo.pending is not None:
+            rpdo.late = False
+            self._vanished(RPDO_TIMEOUT)
+            self._send_emcy(now, out)
+        if not rpdo.synchronous and rpdo.apply(self.od):
+            self.application.applied(now)
+        if rpdo.deadline < self.wake_at:
+            self.wake_at = rpdo.deadline
+
+    # --- time ----------------------------------------------------------------------------------------------------
+
+    def wake(self, now: int, out: Out) -> None:
+        """Serve every timer that is due."""
+        if now >= self.boot_at:
+            self.boot_at = NEVER
+            out.send(self.port, heartbeat_frame(self.node_id, NmtState.INITIALISING))
+            self.nmt.initialised()
+            self.heartbeat.start(now, self.od.values[key_of(0x1017, 0)] * MS)
+        beat = self.heartbeat.wake(now, self.nmt.state)
+        if beat is not None:
+            out.send(self.port, beat)
+        for consumer in self.consumers:
+            if consumer.wake(now):
+                self._communication_error(now, HEARTBEAT_LOST, out)
+        if self.sync_consumer.wake(now) and self.operational:
+            self._communication_error(now, SYNC_LOST, out)
+        for rpdo in self.rpdos:
+            if rpdo.wake(now) and self.operational:
+                self._communication_error(now, RPDO_TIMEOUT, out)
+        answer = self.sdo.expire(now)
+        if answer is not None:
+            out.send(self.port, Frame(SDO_ANSWER + self.node_id, answer))
+        self._send_emcy(now, out)
+        self._plan_wake()
+
+    def _plan_wake(self) -> None:
+        at = min(self.boot_at, self.heartbeat.due, self.sync_consumer.deadline, self.sdo.deadline, self.emcy.due)
+        for consumer in self.consumers:
+            at = min(at, consumer.deadline)
+        for rpdo in self.rpdos:
+            at = min(at, rpdo.deadline)
+        self.wake_at = at
+
+    # --- errors --------------------------------------------------------------------------------------------------
+
+    def error(self, now: int, code: int, class_bit: int, out: Out) -> None:
+        """The application reports an error: EMCY, error register, history."""
+        if self.emcy.occur(code, class_bit):
+            self._send_emcy(now, out)
+            self._plan_wake()
+
+    def clear_errors(self, now: int, out: Out) -> None:
+        """All errors are gone (fault reset)."""
+        self.emcy.clear()
+        self._send_emcy(now, out)
+        self._plan_wake()
+
+    def _vanished(self, code: int) -> None:
+        self.emcy.vanish(code)
+
+    def _communication_error(self, now: int, code: int, out: Out) -> None:
+        """EMCY, the reaction of 0x6007 (application) and of 0x1029:1 (NMT state)."""
+        self.emcy.occur(code, COMMUNICATION_BIT)
+        self.application.communication_lost(now, code)
+        behaviour = self.od.values[key_of(0x1029, 1)]
+        if behaviour == 0 and self.operational:
+            self._apply_command(now, NmtCommand.ENTER_PRE_OPERATIONAL, out)
+        elif behaviour == 2:
+            self._apply_command(now, NmtCommand.STOP, out)
+
+    def _send_emcy(self, now: int, out: Out) -> None:
+        if self.nmt.state is NmtState.INITIALISING or self.nmt.state is NmtState.STOPPED:
+            return
+        while self.emcy.due <= now:
+            frame = self.emcy.wake(now)
+            if frame is not None:
+                out.send(self.port, frame)
+        self._publish_errors()
+
+    def _publish_errors(self) -> None:
+        """Objects 0x1001 and 0x1003 show what the EMCY producer knows."""
+        self.od.set(ERROR_REGISTER, self.emcy.register)
+        history = self.emcy.history
+        self.od.set(key_of(0x1003, 0), len(history))
+        for at in range(len(history)):
+            self.od.set(key_of(0x1003, at + 1), history[at])
+
+    # --- NMT and configuration -----------------------------------------------------------------------------------
+
+    def _command(self, now: int, data: bytes, out: Out) -> None:
+        command = decode_nmt(data, self.node_id)
+        if command is None:
+            if len(data) != 2:
+                self.malformed += 1
+            return
+        self._apply_command(now, command, out)
+
+    def _apply_command(self, now: int, command: NmtCommand, out: Out) -> None:
+        was_operational = self.operational
+        if not self.nmt.command(command):
+            return
+        self.operational = self.nmt.state is NmtState.OPERATIONAL
+        if was_operational and not self.operational:
+            for rpdo in self.rpdos:
+                rpdo.stop()
+            self.sync_consumer.stop()
+            self.application.left_operational(now)
+        if self.nmt.state is NmtState.INITIALISING:
+            self._reset(now, command)
+        elif self.operational:
+            for tpdo in self.tpdos:
+                tpdo.restart()
+
+    def _reset(self, now: int, command: NmtCommand) -> None:
+        """Reset node: all objects; reset communication: 0x1000..0x1FFF. The boot-up message ends it."""
+        if command is NmtCommand.RESET_NODE:
+            self.od.reset()
+            self.application.reset(now)
+        else:
+            self.od.reset(communication_only=True)
+        self.emcy.active.clear()
+        self.emcy.queue.clear()
+        self.emcy.history.clear()
+        self.sdo = SdoServer(self.od, self.node_id)
+        self.nmt = NmtSlave()
+        self.heartbeat.start(now, 0)
+        self.boot_at = now + BOOT_NS
+        self.configure_sync()
+        self.configure_pdos()
+        self.configure_consumers()
+        self._publish_errors()
+        self._plan_wake()
+
+    def configure_sync(self) -> None:
+        """Read 0x1019 and 0x1006 anew."""
+        period_ns = self.od.values[key_of(0x1006, 0)] * 1000
+        self.sync_consumer = SyncConsumer(self.od.values[key_of(0x1019, 0)], SYNC_LOSS_CYCLES * period_ns)
+
+    def configure_pdos(self) -> None:
+        """Read all PDO parameters anew."""
+        self.tpdos = [TransmitPdo(self.od, number) for number in range(PDO_COUNT)]
+        self.rpdos = [ReceivePdo(self.od, number) for number in range(PDO_COUNT)]
+        self.rpdo_by_id = {rpdo.cob_id: rpdo for rpdo in self.rpdos if rpdo.active}
+        self.revision += 1
+
+    def configure_consumers(self) -> None:
+        """Read 0x1016 anew: node id in bits 16-23, time [ms] in bits 0-15."""
+        self.consumers = []
+        for sub in range(1, self.od.values[key_of(0x1016, 0)] + 1):
+            word = self.od.values[key_of(0x1016, sub)]
+            if word >> 16 & 0xFF and word & 0xFFFF:
+                self.consumers.append(HeartbeatConsumer(word >> 16 & 0xFF, (word & 0xFFFF) * MS))
+        self.revision += 1
+
+
+@final
+class _Rules(WriteObserver):
+    """What an SDO write may do to a running device, and what follows from it; the application is asked too."""
+
+    def __init__(self, device: Device) -> None:
+        self.device: Final[Device] = device
+
+    def check(self, key: int, raw: int) -> int:
+        """The abort code, 0 when the write may happen."""
+        device, index, sub = self.device, key >> 8, key & 0xFF
+        values = device.od.values
+        if index == 0x1019 and values[key_of(0x1006, 0)]:
+            return ABORT_DEVICE_STATE  # CiA 301, object 0x1019: not while the communication cycle period is set
+        if index == 0x1019 and (raw == 1 or raw > 240):
+            return ABORT_VALUE_RANGE
+        if index == 0x1016 and sub and raw >> 16 & 0xFF and raw & 0xFFFF:
+            for other in range(1, values[key_of(0x1016, 0)] + 1):
+                if other != sub and values[key_of(0x1016, other)] >> 16 & 0xFF == raw >> 16 & 0xFF:
+                    return ABORT_INCOMPATIBLE
+        if 0x1400 <= index < 0x1400 + PDO_COUNT or 0x1800 <= index < 0x1800 + PDO_COUNT:
+            return self._check_communication(index, sub, raw)
+        if 0x1600 <= index < 0x1600 + PDO_COUNT or 0x1A00 <= index < 0x1A00 + PDO_COUNT:
+            return self._check_mapping(index, sub, raw)
+        return device.application.check(key, raw)
+
+    def _check_communication(self, index: int, sub: int, raw: int) -> int:
+        if sub == 2 and index >= 0x1800 and not 1 <= raw <= 240:
+            return ABORT_VALUE_RANGE  # transmit types other than synchronous cyclic are not there
+        if sub == 2 and index < 0x1800 and 240 < raw < 254:
+            return ABORT_VALUE_RANGE
+        enabled = not self.device.od.values[key_of(index, 1)] & INVALID
+        if sub == 6 and enabled:
+            return ABORT_DEVICE_STATE  # CiA 301, 18xx:6: only while the PDO is not valid
+        return 0
+
+    def _check_mapping(self, index: int, sub: int, raw: int) -> int:
+        """The standard procedure: clear :0, write the entries, set :0 to their number."""
+        od = self.device.od
+        if sub == 0:
+            return mapping_abort(od, index, raw)
+        if od.values[key_of(index, 0)]:
+            return ABORT_DEVICE_STATE
+        return 0
+
+    def written(self, key: int, raw: int) -> None:
+        """Carry the new value to where it acts."""
+        device, index = self.device, key >> 8
+        if index == 0x1017:
+            if device.nmt.state is not NmtState.INITIALISING:
+                device.heartbeat.start(device.now, raw * MS)
+        elif index == 0x1015:
+            device.emcy.inhibit_ns = raw * 100_000  # multiples of 100 us
+        elif index == 0x1003:
+            device.emcy.history.clear()
+        elif index in (0x1006, 0x1019):
+            device.configure_sync()
+        elif index == 0x1016:
+            device.configure_consumers()
+        elif 0x1400 <= index < 0x1C00:
+            device.configure_pdos()
+        else:
+            device.application.written(key, raw)

@@ -1,0 +1,70 @@
+"""SYNC: producer and consumer.
+
+Source: CiA 301, 7.2.5 (synchronisation object), objects 0x1005, 0x1006 (communication cycle period) and 0x1019
+(synchronous counter overflow value: the counter runs 1..overflow).
+The loss of SYNC after a number of periods is a drive's own supervision (no CiA 301 object states it).
+"""
+
+from typing import Final, final
+
+from canopen_exo.bus.frame import Frame
+from canopen_exo.bus.node import NEVER
+from canopen_exo.plan import SYNC
+
+
+@final
+class SyncProducer:
+    """Makes the SYNC frames. counter: the last one sent, 0 before the first; overflow 0: SYNC without data."""
+
+    def __init__(self, overflow: int) -> None:
+        self.overflow: Final[int] = overflow
+        self.counter: int = 0
+
+    def next(self) -> Frame:
+        """The next SYNC frame."""
+        if self.overflow == 0:
+            return Frame(SYNC, b"")
+        self.counter = self.counter % self.overflow + 1
+        return Frame(SYNC, bytes((self.counter,)))
+
+
+@final
+class SyncConsumer:
+    """Checks and watches SYNC for one device.
+
+    overflow: 0x1019. timeout_ns: silence after which SYNC counts as lost, 0 = not watched.
+    Watching starts with the first SYNC and is lazy: `last` moves with every SYNC, `deadline` only when it is reached.
+    """
+
+    def __init__(self, overflow: int, timeout_ns: int) -> None:
+        self.overflow: Final[int] = overflow
+        self.timeout_ns: Final[int] = timeout_ns
+        self.last: int = NEVER
+        self.deadline: int = NEVER
+        self.lost: bool = False
+
+    def received(self, now: int, data: bytes) -> bool:
+        """Take a SYNC; False when its length does not fit 0x1019 (EMCY 8240), and it is not served."""
+        if len(data) != (1 if self.overflow else 0):
+            return False
+        self.last = now
+        if self.deadline == NEVER and self.timeout_ns:
+            self.deadline = now + self.timeout_ns
+        self.lost = False
+        return True
+
+    def stop(self) -> None:
+        """Watch no more until the next SYNC."""
+        self.deadline = NEVER
+        self.lost = False
+
+    def wake(self, now: int) -> bool:
+        """True once, when SYNC has been silent for the time-out."""
+        if now < self.deadline:
+            return False
+        if now < self.last + self.timeout_ns:
+            self.deadline = self.last + self.timeout_ns
+            return False
+        self.deadline = NEVER
+        self.lost = True
+        return True

@@ -1,0 +1,102 @@
+"""Six drives on one plant, as one node with a port per drive.
+
+The physics does not hang on the bus: every 1 ms the rack steps drives and plant by itself, so a lost SYNC or a stopped
+bus leaves the plant falling, as in reality. The wake-up at k ms integrates (k-1, k] ms with the torques held then;
+SYNC latches the last finished step.
+"""
+
+from typing import Final, final
+
+from canopen_exo.bus.frame import Frame
+from canopen_exo.bus.node import Node, Out
+from canopen_exo.device import Device
+from joint_emulators.drive import Drive
+from joint_emulators.plant import STEP_NS, Plant
+
+
+@final
+class TruthRow:
+    """The plant after a step: lists of n_joints. time_ns: loop clock; q rad, dq rad/s, tau N m after the gear."""
+
+    __slots__ = ("dq", "q", "tau", "time_ns")
+
+    def __init__(self, time_ns: int, q: list[float], dq: list[float], tau: list[float]) -> None:
+        self.time_ns: Final[int] = time_ns
+        self.q: Final[list[float]] = q
+        self.dq: Final[list[float]] = dq
+        self.tau: Final[list[float]] = tau
+
+
+@final
+class Rack(Node):
+    """Drives on a plant. devices[k] sends on port k and drives joint k. truth: one row per step, from the start."""
+
+    def __init__(self, plant: Plant, devices: list[Device], drives: list[Drive]) -> None:
+        super().__init__()
+        self.plant: Final[Plant] = plant
+        self.devices: Final[list[Device]] = devices
+        self.drives: Final[list[Drive]] = drives
+        self.truth: list[TruthRow] = []
+        self.step_at: int = STEP_NS
+        self.wake_at = 0
+        self._hearing: list[list[Device]] = []
+        self._revision: int = -1
+        self._route()
+        self._sense()
+
+    def receive(self, now: int, port: int, frame: Frame, out: Out) -> None:
+        """A frame on the drive bus: to the devices that listen to its id."""
+        if frame.flags:
+            return
+        can_id = frame.can_id
+        hearing = self._hearing[can_id]
+        if not hearing:
+            return
+        for device in hearing:
+            device.receive(now, 0, frame, out)
+            if device.wake_at < self.wake_at:
+                self.wake_at = device.wake_at
+        if can_id == 0 or can_id >= 0x580:  # NMT and SDO may change what the devices listen to
+            self._route()
+
+    def wake(self, now: int, out: Out) -> None:
+        """The plant's next step, and the devices' timers."""
+        if now >= self.step_at:
+            self._step(now)
+        at = self.step_at
+        for device in self.devices:
+            if device.wake_at <= now:
+                device.wake(now, out)
+            if device.wake_at < at:
+                at = device.wake_at
+        self.wake_at = at
+
+    def _step(self, now: int) -> None:
+        torques: list[float] = []
+        for drive in self.drives:
+            torques.append(drive.torque_nm)
+        plant = self.plant
+        plant.step(torques)
+        self._sense()
+        self.truth.append(TruthRow(now, plant.q, plant.dq, plant.tau))
+        self.step_at += STEP_NS
+
+    def _sense(self) -> None:
+        q, tau = self.plant.q, self.plant.tau
+        joint = 0
+        for drive in self.drives:
+            drive.sense(q[joint], tau[joint])
+            joint += 1
+
+    def _route(self) -> None:
+        """Which devices hear which 11-bit id."""
+        revision = 0
+        for device in self.devices:
+            revision += device.revision
+        if revision == self._revision:
+            return
+        self._revision = revision
+        self._hearing = [[] for _ in range(2048)]
+        for device in self.devices:
+            for can_id in device.cob_ids():
+                self._hearing[can_id].append(device)

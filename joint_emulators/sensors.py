@@ -1,0 +1,126 @@
+"""What a joint's drive can sense: encoder counts, the speed it makes of them, and three hall signals.
+
+Encoder: absolute over many turns, on the joint side of the gear, quantised to the nearest count (round half up).
+Speed: the difference of counts over one sample, through a first-order low-pass; in counts/s as object 0x606C has it
+(CiA 402-2). Hall sensors: three signals 120 electrical degrees apart, each high for half an electrical turn.
+Left out: noise, index pulse, nonlinearity, and the faults of sensors.
+"""
+
+import math
+from dataclasses import dataclass, field
+from typing import Final, final
+
+from joint_emulators.errors import JointEmulatorError
+
+INT32_MIN: Final = -(1 << 31)
+INT32_MAX: Final = (1 << 31) - 1
+
+
+def _saturate(value: float) -> int:
+    """Nearest integer (half up), clipped to int32: 0x6064 and 0x606C do not wrap."""
+    if value >= INT32_MAX:
+        return INT32_MAX
+    if value <= INT32_MIN:
+        return INT32_MIN
+    return math.floor(value + 0.5)
+
+
+@dataclass(frozen=True, slots=True)
+class EncoderParams:
+    """counts_per_revolution: of the joint; offset: counts at q = 0; direction: 1, or -1 when mounted the other way."""
+
+    counts_per_revolution: int
+    offset: int
+    direction: int
+
+    def __post_init__(self) -> None:
+        """Refuse values that are no encoder; raises JointEmulatorError."""
+        if self.counts_per_revolution < 1:
+            raise JointEmulatorError(f"encoder: {self.counts_per_revolution} counts a revolution given, allowed from 1")
+        if self.direction not in (1, -1):
+            raise JointEmulatorError(f"encoder: direction {self.direction} given, allowed 1 or -1")
+
+
+ENCODER: Final = EncoderParams(131072, 0, 1)
+"""17 bit per joint revolution: 48 microradians a count."""
+
+
+def encode(q: float, params: EncoderParams) -> int:
+    """Counts at the joint angle q [rad, finite]; clipped at int32 (16384 turns of a 17-bit encoder)."""
+    return _saturate(params.direction * q * params.counts_per_revolution / (2.0 * math.pi) + params.offset)
+
+
+@dataclass(frozen=True, slots=True)
+class VelocityEstimateParams:
+    """sample_s: time between two calls of `estimate_velocity` [s]; cutoff_hz: of the low-pass, -3 dB.
+
+    gain: share of the way to its input that the low-pass goes in one sample, 1 - exp(-2 pi cutoff sample).
+    """
+
+    sample_s: float
+    cutoff_hz: float
+    gain: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Refuse values that are no filter; raises JointEmulatorError."""
+        if not (0.0 < self.sample_s < math.inf and 0.0 < self.cutoff_hz < math.inf):
+            raise JointEmulatorError(
+                f"velocity estimate: sample {self.sample_s} s and cut-off {self.cutoff_hz} Hz given, "
+                "allowed are finite values above 0"
+            )
+        object.__setattr__(self, "gain", 1.0 - math.exp(-2.0 * math.pi * self.cutoff_hz * self.sample_s))
+
+
+VELOCITY: Final = VelocityEstimateParams(0.001, 100.0)
+"""Drive default: 1 ms, 100 Hz. One count more in a single sample shows as 467 counts/s (0.022 rad/s at 17 bit)."""
+
+
+@final
+class VelocityEstimateState:
+    """counts: of the last sample; filtered: counts/s; started: whether there was a last sample."""
+
+    def __init__(self) -> None:
+        self.counts = 0
+        self.filtered = 0.0
+        self.started = False
+
+
+def estimate_velocity(params: VelocityEstimateParams, state: VelocityEstimateState, counts: int) -> int:
+    """Speed [counts/s, int32] after the next sample of the encoder; 0 on the first one, which has no difference."""
+    if state.started:
+        raw = (counts - state.counts) / params.sample_s
+        state.filtered += params.gain * (raw - state.filtered)
+    state.counts = counts
+    state.started = True
+    return _saturate(state.filtered)
+
+
+@dataclass(frozen=True, slots=True)
+class HallParams:
+    """pole_pairs: electrical turns per shaft turn; gear_ratio: shaft turns per joint turn.
+
+    offset_rad: electrical angle at q = 0.
+    """
+
+    pole_pairs: int
+    gear_ratio: float
+    offset_rad: float
+
+    def __post_init__(self) -> None:
+        """Refuse values that are no motor; raises JointEmulatorError."""
+        if self.pole_pairs < 1 or not 0.0 < self.gear_ratio < math.inf:
+            raise JointEmulatorError(f"hall sensors: {self} given, allowed are pole_pairs from 1, gear_ratio above 0")
+
+
+_SECTORS: Final = (5, 1, 3, 2, 6, 4)
+
+
+def hall_state(q: float, params: HallParams) -> int:
+    """The three signals at the joint angle q [rad], a + 2 b + 4 c, always 1..6 (0 and 7 are illegal).
+
+    a is high for electrical angles 0..180 deg, b for 120..300, c for 240..420: the sectors of 60 deg from 0 on give
+    5 1 3 2 6 4.
+    """
+    turns = (q * params.gear_ratio * params.pole_pairs + params.offset_rad) / (2.0 * math.pi)
+    sector = math.floor(6.0 * (turns - math.floor(turns)))
+    return _SECTORS[min(sector, 5)]  # a turn just below a whole one may round up to it
