@@ -149,7 +149,7 @@ class Device(Node):
         counter = data[0] if data else 0
         values = self.od.values
         for tpdo in self.tpdos:
-            if tpdo.active and tpdo.on_sync(counter):
+            if tpdo.on_sync(counter):
                 out.send(self.port, tpdo.frame(values))
         if consumer.deadline < self.wake_at:
             self.wake_at = consumer.deadline
@@ -180,29 +180,33 @@ class Device(Node):
             out.send(self.port, heartbeat_frame(self.node_id, NmtState.INITIALISING))
             self.nmt.initialised()
             self.heartbeat.start(now, self.od.values[key_of(0x1017, 0)] * MS)
-        beat = self.heartbeat.wake(now, self.nmt.state)
-        if beat is not None:
-            out.send(self.port, beat)
+        if now >= self.heartbeat.due:
+            out.send(self.port, self.heartbeat.beat(now, self.nmt.state))
         for consumer in self.consumers:
-            if consumer.wake(now):
+            if now >= consumer.deadline:
+                consumer.lose()
                 self._communication_error(now, HEARTBEAT_LOST, out)
-        if self.sync_consumer.wake(now) and self.operational:
+        if now >= self.sync_consumer.deadline and self.sync_consumer.wake(now):
             self._communication_error(now, SYNC_LOST, out)
         for rpdo in self.rpdos:
-            if rpdo.wake(now) and self.operational:
+            if now >= rpdo.deadline and rpdo.wake(now):
                 self._communication_error(now, RPDO_TIMEOUT, out)
-        answer = self.sdo.expire(now)
-        if answer is not None:
-            out.send(self.port, Frame(SDO_ANSWER + self.node_id, answer))
-        self._send_emcy(now, out)
+        if now >= self.sdo.deadline:
+            answer = self.sdo.expire(now)
+            if answer is not None:
+                out.send(self.port, Frame(SDO_ANSWER + self.node_id, answer))
+        if self.emcy.queue:
+            self._send_emcy(now, out)
         self._plan_wake()
 
     def _plan_wake(self) -> None:
         at = min(self.boot_at, self.heartbeat.due, self.sync_consumer.deadline, self.sdo.deadline, self.emcy.due)
         for consumer in self.consumers:
-            at = min(at, consumer.deadline)
+            if consumer.deadline < at:
+                at = consumer.deadline
         for rpdo in self.rpdos:
-            at = min(at, rpdo.deadline)
+            if rpdo.deadline < at:
+                at = rpdo.deadline
         self.wake_at = at
 
     # --- errors --------------------------------------------------------------------------------------------------
@@ -301,10 +305,12 @@ class Device(Node):
         self.sync_consumer = SyncConsumer(self.od.values[key_of(0x1019, 0)], SYNC_LOSS_CYCLES * period_ns)
 
     def configure_pdos(self) -> None:
-        """Read all PDO parameters anew."""
-        self.tpdos = [TransmitPdo(self.od, number) for number in range(PDO_COUNT)]
-        self.rpdos = [ReceivePdo(self.od, number) for number in range(PDO_COUNT)]
-        self.rpdo_by_id = {rpdo.cob_id: rpdo for rpdo in self.rpdos if rpdo.active}
+        """Read all PDO parameters anew; `tpdos` and `rpdos` are the active ones."""
+        tpdos = [TransmitPdo(self.od, number) for number in range(PDO_COUNT)]
+        rpdos = [ReceivePdo(self.od, number) for number in range(PDO_COUNT)]
+        self.tpdos = [tpdo for tpdo in tpdos if tpdo.active]
+        self.rpdos = [rpdo for rpdo in rpdos if rpdo.active]
+        self.rpdo_by_id = {rpdo.cob_id: rpdo for rpdo in self.rpdos}
         self.revision += 1
 
     def configure_consumers(self) -> None:

@@ -47,7 +47,7 @@ def _load(resource: str) -> tuple[Entry, ...]:
 
 
 def parse_eds(text: str, where: str) -> list[Entry]:
-    """The entries of an EDS text, in file order; `where` names it in messages.
+    """The entries of an EDS text, by index and sub-index; `where` names it in messages.
 
     Raises CanopenExoError naming the file, the objects and what is wrong with them, all mistakes at once.
     """
@@ -177,6 +177,11 @@ def _object_problems(keys: dict[str, str]) -> list[str]:
         plain = _NODE_ID.sub("", value).strip() or "0" if key == "DefaultValue" else value
         if value and not _is_number(plain):
             found.append(f"{key}={value} given, allowed is a number such as 10, -3 or 0x1F")
+        elif value:
+            raw, bits = _number(plain, int(code, 0)), BITS[int(code, 0)]
+            low, high = (-(1 << (bits - 1)), (1 << (bits - 1)) - 1) if int(code, 0) in SIGNED else (0, (1 << bits) - 1)
+            if not low <= raw <= high:
+                found.append(f"{key}={value} given, allowed {low}..{high} for DataType={code}")
     return found
 
 

@@ -31,10 +31,8 @@ class HeartbeatProducer:
         self.period_ns = period_ns
         self.due = now + period_ns if period_ns else NEVER
 
-    def wake(self, now: int, state: NmtState) -> Frame | None:
-        """The heartbeat, when it is due."""
-        if now < self.due:
-            return None
+    def beat(self, now: int, state: NmtState) -> Frame:
+        """The heartbeat that is due, and the time of the next one."""
         self.due += self.period_ns
         if self.due <= now:  # woken late, as on a real clock: no burst to catch up
             self.due = now + self.period_ns
@@ -65,10 +63,7 @@ class HeartbeatConsumer:
         self.lost = False
         return back
 
-    def wake(self, now: int) -> bool:
-        """True once, when the producer has been silent for the time-out."""
-        if now < self.deadline:
-            return False
+    def lose(self) -> None:
+        """`deadline` is reached: the producer has been silent for the time-out."""
         self.deadline = NEVER
         self.lost = True
-        return True

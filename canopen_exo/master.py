@@ -220,6 +220,7 @@ class Master(Node):
         self.failure: str = ""
         self.boot_deadline: int = NEVER
         self.sync_at: int = NEVER
+        self.supervise_at: int = 0
         self.wake_at = 0
         self._by_node: Final[dict[int, int]] = {config.node_id: at for at, config in enumerate(slaves)}
         self._pdo_slave: Final[dict[int, int]] = {}
@@ -239,8 +240,7 @@ class Master(Node):
         if slave >= 0:
             if self.state is MasterState.OPERATIONAL:
                 self.application.process_data(now, slave, self._pdo_number[can_id], frame.data, out)
-                if self.application.wake_at < self.wake_at:
-                    self.wake_at = self.application.wake_at
+                self._plan_wake()
             return
         at = self._by_node.get(can_id & 0x7F, -1)
         if at < 0:
@@ -255,32 +255,40 @@ class Master(Node):
             emergency = decode_emcy(can_id & 0x7F, frame.data)
             if emergency is not None:
                 self.application.emergency(now, at, emergency, out)
+        self._plan_supervision()
         self._plan_wake()
 
     def wake(self, now: int, out: Out) -> None:
         """Serve every timer that is due; SYNC first."""
+        application = self.application
         if now >= self.sync_at:
             out.send(0, self.sync.next())
             self.sync_at += self.plan.cycle_ns
-            self.application.synchronised(now, out)
-        if self.application.wake_at <= now:
-            self.application.wake(now, out)
-        if self.application.finished and self.state is MasterState.OPERATIONAL:
+            application.synchronised(now, out)
+        if now >= application.wake_at:
+            application.wake(now, out)
+        if application.finished and self.state is MasterState.OPERATIONAL:
             self._stop(out)
+        if now >= self.supervise_at:
+            self._supervise(now, out)
+        self._plan_wake()
+
+    def _supervise(self, now: int, out: Out) -> None:
+        """Everything slower than SYNC: heartbeats both ways, time-outs of the start."""
         if self.state is MasterState.RESETTING:
             self._reset(now, out)
-        beat = self.heartbeat.wake(now, NmtState.OPERATIONAL)
-        if beat is not None:
-            out.send(0, beat)
+        if now >= self.heartbeat.due:
+            out.send(0, self.heartbeat.beat(now, NmtState.OPERATIONAL))
         if self.state is not MasterState.FAILED:
             at = 0
             for slave in self.slaves:
                 self._send(at, slave.wake(now, self.boot_deadline), out)
-                if slave.consumer.wake(now):
+                if now >= slave.consumer.deadline:
+                    slave.consumer.lose()
                     self.application.node_lost(now, at, out)
                 at += 1
             self._advance(now, out)
-        self._plan_wake()
+        self._plan_supervision()
 
     def _stop(self, out: Out) -> None:
         """Leave: no more SYNC, all devices to Pre-operational."""
@@ -328,14 +336,20 @@ class Master(Node):
             self.sync_at = (now // cycle + 2) * cycle  # every device has had the start command by then
             self.application.operational(now, out)
 
-    def _plan_wake(self) -> None:
-        at = min(self.sync_at, self.heartbeat.due, self.application.wake_at)
-        if self.state is MasterState.RESETTING:
-            at = 0
-        elif self.state is MasterState.BOOTING:
+    def _plan_supervision(self) -> None:
+        at = self.heartbeat.due
+        if self.state is MasterState.BOOTING:
             for slave in self.slaves:
                 at = min(at, slave.deadline if slave.booted else self.boot_deadline)
         elif self.state is not MasterState.FAILED:
             for slave in self.slaves:
                 at = min(at, slave.consumer.deadline)
+        self.supervise_at = at
+
+    def _plan_wake(self) -> None:
+        at = self.sync_at
+        if self.supervise_at < at:
+            at = self.supervise_at
+        if self.application.wake_at < at:
+            at = self.application.wake_at
         self.wake_at = at

@@ -5,6 +5,8 @@ Transmission types: transmit 1-240 (every n-th SYNC, with SYNC start value); rec
 next SYNC) and 254, 255 (applied at once). Leaves out: transmit types 0 and 252-255, inhibit time, event timer.
 """
 
+from collections.abc import Callable, Sequence
+from operator import itemgetter
 from typing import Final, final
 
 from canopen_exo.bus.frame import Frame
@@ -60,6 +62,13 @@ def _mapping(od: ObjectDictionary, map_index: int) -> tuple[list[int], Codec]:
     return keys, compile_codec(fields)
 
 
+def _reader(keys: list[int]) -> Callable[[dict[int, int]], Sequence[int]]:
+    """Takes the values of `keys` out of a dictionary, in one call."""
+    if len(keys) > 1:
+        return itemgetter(*keys)
+    return lambda values: [values[key] for key in keys]
+
+
 @final
 class TransmitPdo:
     """A TPDO. active: exists and has a synchronous type; cob_id: its id; every: sent on each n-th SYNC.
@@ -75,6 +84,7 @@ class TransmitPdo:
         keys, codec = _mapping(od, map_index)
         self.keys: Final[list[int]] = keys
         self.codec: Final[Codec] = codec
+        self._read: Final[Callable[[dict[int, int]], Sequence[int]]] = _reader(keys)
         self.active: Final[bool] = not cob & INVALID and 1 <= self.every <= 240 and len(keys) > 0
         self.start: Final[int] = od.values[key_of(comm, 6)]
         self.countdown: int = 0 if self.start else self.every
@@ -98,10 +108,7 @@ class TransmitPdo:
 
     def frame(self, values: dict[int, int]) -> Frame:
         """The PDO with the present values of its objects."""
-        raw: list[int] = []
-        for key in self.keys:
-            raw.append(values[key])
-        return Frame(self.cob_id, self.codec.pack(raw))
+        return Frame(self.cob_id, self.codec.pack(self._read(values)))
 
 
 @final
@@ -119,6 +126,8 @@ class ReceivePdo:
         keys, codec = _mapping(od, map_index)
         self.keys: Final[list[int]] = keys
         self.codec: Final[Codec] = codec
+        self._low: Final[list[int]] = [od.entries[key].low for key in keys]
+        self._high: Final[list[int]] = [od.entries[key].high for key in keys]
         self.active: Final[bool] = not cob & INVALID and len(keys) > 0
         self.synchronous: Final[bool] = kind <= 240
         self.timeout_ns: Final[int] = od.values[key_of(comm, 5)] * MS
@@ -139,15 +148,20 @@ class ReceivePdo:
         return PDO_TOO_LONG if size > self.codec.size else 0
 
     def apply(self, od: ObjectDictionary) -> bool:
-        """Move the pending payload into the object dictionary; False when there is none."""
+        """Move the pending payload into the object dictionary; False when there is none.
+
+        A value beyond the limits of its object is left out, as an SDO write of it would be refused.
+        """
         data = self.pending
         if data is None:
             return False
         self.pending = None
-        values = self.codec.unpack(data)
+        raw = self.codec.unpack(data)
+        values = od.values
         at = 0
         for key in self.keys:
-            od.set(key, values[at])
+            if self._low[at] <= raw[at] <= self._high[at]:
+                values[key] = raw[at]
             at += 1
         return True
 

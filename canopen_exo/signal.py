@@ -6,6 +6,7 @@ SI floats become raw integers only here, once at each end. Raw values that do no
 
 import math
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, final
 
@@ -87,11 +88,11 @@ class Codec:
 
     size: int
 
-    def pack(self, values: list[int]) -> bytes:
+    def pack(self, values: Sequence[int]) -> bytes:
         """Payload of raw values; each must fit (the object dictionary clips on writing)."""
         raise NotImplementedError
 
-    def unpack(self, data: bytes) -> list[int]:
+    def unpack(self, data: bytes) -> tuple[int, ...]:
         """Raw values of a payload of at least `size` bytes; further bytes are ignored."""
         raise NotImplementedError
 
@@ -105,11 +106,11 @@ class _StructCodec(Codec):
         self._pack: Final = layout.pack
         self._unpack_from: Final = layout.unpack_from
 
-    def pack(self, values: list[int]) -> bytes:
+    def pack(self, values: Sequence[int]) -> bytes:
         return self._pack(*values)
 
-    def unpack(self, data: bytes) -> list[int]:
-        return list(self._unpack_from(data))
+    def unpack(self, data: bytes) -> tuple[int, ...]:
+        return self._unpack_from(data)
 
 
 @final
@@ -120,19 +121,19 @@ class _BitCodec(Codec):
         self.size = (sum(length for length, _ in fields) + 7) // 8
         self._fields: Final = fields
 
-    def pack(self, values: list[int]) -> bytes:
+    def pack(self, values: Sequence[int]) -> bytes:
         word, at = 0, 0
         for (length, _), value in zip(self._fields, values, strict=True):
             word |= (value & ((1 << length) - 1)) << at
             at += length
         return word.to_bytes(self.size, "little")
 
-    def unpack(self, data: bytes) -> list[int]:
+    def unpack(self, data: bytes) -> tuple[int, ...]:
         values, at = [], 0
         for length, signed in self._fields:
             values.append(read_bits(data, at, length, signed))
             at += length
-        return values
+        return tuple(values)
 
 
 _LETTERS: Final = {8: "b", 16: "h", 32: "i", 64: "q"}

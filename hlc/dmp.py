@@ -34,7 +34,7 @@ from hlc.gait import Gait
 Array = NDArray[np.float64]
 
 ALPHA_Z: Final = 25.0
-"""Gain of the transformation system (Ijspeert et al. 2013, section 2.1.2: 25); beta_z = alpha_z / 4."""
+"""Gain of the transformation system: the value customary in the literature, the paper gives none."""
 
 BASIS_FUNCTIONS: Final = 25
 """With WIDTH they reproduce seven harmonics to below 1e-7 rad."""

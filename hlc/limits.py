@@ -33,7 +33,7 @@ class JointLimits:
 def from_table(torque_nm: float, speed_rpm: float, min_angle_deg: float, max_angle_deg: float) -> JointLimits:
     """Limits in the units tables are printed in: N m, revolutions a minute, degrees."""
     return JointLimits(
-        torque_nm, speed_rpm * math.pi / 30, min_angle_deg * math.pi / 180, max_angle_deg * math.pi / 180
+        torque_nm, math.tau * (speed_rpm / 60), math.radians(min_angle_deg), math.radians(max_angle_deg)
     )
 
 

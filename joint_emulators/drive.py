@@ -8,11 +8,11 @@ Leaves out: every mode but CST, following error, position limits, temperature, s
 import math
 from typing import Final, final
 
-from canopen_exo.cia402 import INTERNAL_LIMIT, DriveCommand, DriveState, DriveStateMachine
+from canopen_exo.cia402 import FAULT_RESET_BIT, INTERNAL_LIMIT, DriveCommand, DriveState, DriveStateMachine
 from canopen_exo.device import Application
 from canopen_exo.od import ABORT_VALUE, ObjectDictionary
 from canopen_exo.pdo import key_of
-from joint_emulators.sensors import EncoderParams, VelocityEstimateParams, VelocityEstimateState, encode, estimate_velocity
+from joint_emulators.sensors import EncoderParams, VelocityEstimateParams, VelocityEstimateState, encode, estimate_velocity, to_int32
 
 CYCLIC_SYNCHRONOUS_TORQUE: Final = 10
 NO_MODE: Final = 0
@@ -51,15 +51,15 @@ class Drive(Application):
         self.estimate: Final[VelocityEstimateState] = VelocityEstimateState()
         self.torque_nm: float = 0.0
         self.position_counts: int = 0
-        self.velocity_counts: int = 0
         self.torque_actual_nm: float = 0.0
         self._nm_per_raw: float = od.values[RATED_TORQUE] * 1e-6
+        self._driving: bool = False
         self._limited: bool = False
 
     def sense(self, q: float, tau: float) -> None:
         """One sample [1 ms] of the sensors. q: joint angle, rad; tau: joint torque after the gear, N m."""
         counts = encode(q, self.encoder)
-        self.velocity_counts = estimate_velocity(self.velocity, self.estimate, counts)
+        estimate_velocity(self.velocity, self.estimate, counts)
         self.position_counts = counts
         self.torque_actual_nm = tau
 
@@ -74,18 +74,21 @@ class Drive(Application):
         """New process data: controlword and target torque."""
         controlword = self.od.values[CONTROLWORD]
         machine = self.machine
-        if controlword != machine.last and machine.controlword(controlword):
-            if machine.state is DriveState.QUICK_STOP_ACTIVE:
-                machine.command(DriveCommand.DISABLE_VOLTAGE)  # 605A = 0
-            elif machine.state is DriveState.SWITCH_ON_DISABLED and controlword & 0x80:
-                self.od.set(ERROR_CODE, 0)
-        self._update()
+        if controlword != machine.last:
+            if machine.controlword(controlword):
+                if machine.state is DriveState.QUICK_STOP_ACTIVE:
+                    machine.command(DriveCommand.DISABLE_VOLTAGE)  # 605A = 0
+                elif machine.state is DriveState.SWITCH_ON_DISABLED and controlword & FAULT_RESET_BIT:
+                    self.od.set(ERROR_CODE, 0)
+            self._update()
+        else:
+            self._command_torque()
 
     def latch(self, now: int) -> None:
         """The last finished samples become the actual values."""
         values = self.od.values
         values[POSITION] = self.position_counts
-        values[VELOCITY] = self.velocity_counts
+        values[VELOCITY] = to_int32(self.estimate.filtered)
         raw = math.floor(self.torque_actual_nm / self._nm_per_raw + 0.5)
         values[TORQUE] = raw if -32768 <= raw <= 32767 else (32767 if raw > 0 else -32768)
 
@@ -106,8 +109,10 @@ class Drive(Application):
 
     def written(self, key: int, raw: int) -> None:
         """An SDO write acts like process data."""
-        if key in (CONTROLWORD, MODE, TARGET_TORQUE, MAX_TORQUE):
+        if key == CONTROLWORD:
             self.applied(0)
+        elif key in (MODE, TARGET_TORQUE, MAX_TORQUE):
+            self._update()
 
     # --- reactions -----------------------------------------------------------------------------------------------
 
@@ -122,19 +127,28 @@ class Drive(Application):
         self._update()
 
     def _update(self) -> None:
-        """Torque, statusword and displays from state, mode and limits."""
-        od, machine = self.od, self.machine
-        values = od.values
+        """Torque, statusword and mode display from state, mode and limits."""
+        values, machine = self.od.values, self.machine
+        self._driving = machine.state is DriveState.OPERATION_ENABLED and values[MODE] == CYCLIC_SYNCHRONOUS_TORQUE
+        values[MODE_DISPLAY] = values[MODE]
+        values[STATUSWORD] = machine.statusword
+        self._limited = False
+        self._command_torque()
+
+    def _command_torque(self) -> None:
+        """The torque asked for, within the limit; the statusword tells when the limit acts."""
+        values = self.od.values
         raw = 0
         limited = False
-        if machine.state is DriveState.OPERATION_ENABLED and values[MODE] == CYCLIC_SYNCHRONOUS_TORQUE:
+        if self._driving:
             raw = values[TARGET_TORQUE]
             limit = values[MAX_TORQUE]
             if raw > limit:
                 raw, limited = limit, True
             elif raw < -limit:
                 raw, limited = -limit, True
+        if limited != self._limited:
+            self._limited = limited
+            values[STATUSWORD] ^= INTERNAL_LIMIT
         self.torque_nm = raw * self._nm_per_raw
         values[TORQUE_DEMAND] = raw
-        values[MODE_DISPLAY] = values[MODE]
-        values[STATUSWORD] = machine.statusword | (INTERNAL_LIMIT if limited else 0)

@@ -13,7 +13,7 @@ What the actuator with `input="ff"` does, measured with MuJoCo 4.0.1 and held by
 - `saturation` clips the torque only; the current behind it grows on. It is set to the same limit, for the one case
   where the driver does not rule the current: above the speed at which back-EMF exceeds the supply.
 - `controller` with Vmax (its last number) clips the terminal voltage: the supply. Under full torque the speed then
-  settles at V / (K g + R D / (K g)) for gear g and joint damping D. A joint driven faster than that brakes itself.
+  settles at V / (K g + R D / (K g)) for gear g and joint damping D. A joint driven faster than V / (K g) brakes itself.
 
 A disabled drive is a command of zero: after the lag the current is zero and the joint swings freely, held only by the
 joint damping and by the rotor's inertia through the gear. It is not a short-circuited winding, which would brake.

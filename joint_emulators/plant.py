@@ -1,7 +1,7 @@
 """The body in the machine: MuJoCo steps it by 1 ms under joint torques; only this module of the package knows mujoco.
 
 Input is the joint torque each driver is asked for; the motors' current lag and limits are the model's `dcmotor`
-actuators (joint_emulators.motor says what they do). Output is the truth: angles, speeds, torques that reached the joints.
+actuators (joint_emulators.motor says what they do). Output is the truth: angles, speeds, torques after the gear.
 Left out: sensors (joint_emulators.sensors), drive firmware, contacts (the model decides).
 """
 
@@ -134,8 +134,6 @@ def _layout(model: mujoco.MjModel, joint_names: tuple[str, ...]) -> _Layout:
     driven = model.actuator_trnid[:, 0].tolist()
     if driven != ids or model.nu != len(ids):
         names = ", ".join(there[i] for i in driven) or "nothing"
-        raise JointEmulatorError(
-            f"plant: the model's actuators drive {names}; needed is one for each of {', '.join(joint_names)}, in this order"
-        )
+        raise JointEmulatorError(f"plant: actuators drive {names}; needed is one for each of {joint_names}, in order")
     qpos_at, dof_at = int(model.jnt_qposadr[first]), int(model.jnt_dofadr[first])
     return _Layout(joint_names, qpos_at, dof_at, model.actuator_gear[:, 0].tolist())

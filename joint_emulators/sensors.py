@@ -16,7 +16,7 @@ INT32_MIN: Final = -(1 << 31)
 INT32_MAX: Final = (1 << 31) - 1
 
 
-def _saturate(value: float) -> int:
+def to_int32(value: float) -> int:
     """Nearest integer (half up), clipped to int32: 0x6064 and 0x606C do not wrap."""
     if value >= INT32_MAX:
         return INT32_MAX
@@ -47,19 +47,21 @@ ENCODER: Final = EncoderParams(131072, 0, 1)
 
 def encode(q: float, params: EncoderParams) -> int:
     """Counts at the joint angle q [rad, finite]; clipped at int32 (16384 turns of a 17-bit encoder)."""
-    return _saturate(params.direction * q * params.counts_per_revolution / (2.0 * math.pi) + params.offset)
+    return to_int32(params.direction * q * params.counts_per_revolution / (2.0 * math.pi) + params.offset)
 
 
 @dataclass(frozen=True, slots=True)
 class VelocityEstimateParams:
     """sample_s: time between two calls of `estimate_velocity` [s]; cutoff_hz: of the low-pass, -3 dB.
 
-    gain: share of the way to its input that the low-pass goes in one sample, 1 - exp(-2 pi cutoff sample).
+    rate_hz: samples a second; gain: share of the way to its input that the low-pass goes in one sample,
+    1 - exp(-2 pi cutoff sample).
     """
 
     sample_s: float
     cutoff_hz: float
     gain: float = field(init=False)
+    rate_hz: float = field(init=False)
 
     def __post_init__(self) -> None:
         """Refuse values that are no filter; raises JointEmulatorError."""
@@ -68,6 +70,7 @@ class VelocityEstimateParams:
                 f"velocity estimate: sample {self.sample_s} s and cut-off {self.cutoff_hz} Hz given, "
                 "allowed are finite values above 0"
             )
+        object.__setattr__(self, "rate_hz", 1.0 / self.sample_s)
         object.__setattr__(self, "gain", 1.0 - math.exp(-2.0 * math.pi * self.cutoff_hz * self.sample_s))
 
 
@@ -85,14 +88,13 @@ class VelocityEstimateState:
         self.started = False
 
 
-def estimate_velocity(params: VelocityEstimateParams, state: VelocityEstimateState, counts: int) -> int:
-    """Speed [counts/s, int32] after the next sample of the encoder; 0 on the first one, which has no difference."""
+def estimate_velocity(params: VelocityEstimateParams, state: VelocityEstimateState, counts: int) -> float:
+    """Speed [counts/s] after the next sample of the encoder; 0 on the first one, which has no difference."""
     if state.started:
-        raw = (counts - state.counts) / params.sample_s
-        state.filtered += params.gain * (raw - state.filtered)
+        state.filtered += params.gain * ((counts - state.counts) * params.rate_hz - state.filtered)
     state.counts = counts
     state.started = True
-    return _saturate(state.filtered)
+    return state.filtered
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,9 +24,10 @@ class Frame:
     can_id: 11-bit, or 29-bit with FLAG_EXTENDED. data: 0..8 bytes (up to 64 with FLAG_FD), empty for a remote frame.
     flags: the FLAG_ constants. dlc: as on the wire; equals len(data) unless given (remote frames, raw DLC 9..15).
     arbitration: the bits that compete for the bus, as one integer; the lower one wins.
+    bits: length on the wire, stuffing and 3-bit intermission included; 0 until `measure` has worked it out.
     """
 
-    __slots__ = ("_bits", "arbitration", "can_id", "data", "dlc", "flags")
+    __slots__ = ("arbitration", "bits", "can_id", "data", "dlc", "flags")
 
     def __init__(self, can_id: int, data: bytes, flags: int = 0, dlc: int = -1) -> None:
         self.can_id: Final[int] = can_id
@@ -45,16 +46,14 @@ class Frame:
                 self.arbitration = (can_id >> 18) << 21 | 3 << 19 | (can_id & 0x3FFFF) << 1 | remote
             else:  # ID, RTR, IDE 0
                 self.arbitration = can_id << 21 | remote << 20
-        self._bits: int = 0
+        self.bits: int = 0
 
-    @property
-    def bits(self) -> int:
-        """Length on the wire in bits, stuffing and 3-bit intermission included; worked out once."""
-        if self._bits == 0:
-            self._bits = frame_bits(
-                self.can_id, self.data, self.flags & FLAG_EXTENDED != 0, self.flags & FLAG_REMOTE != 0, self.dlc
-            )
-        return self._bits
+    def measure(self) -> int:
+        """Work out `bits`; once is enough, both hops of a gateway use it."""
+        self.bits = frame_bits(
+            self.can_id, self.data, self.flags & FLAG_EXTENDED != 0, self.flags & FLAG_REMOTE != 0, self.dlc
+        )
+        return self.bits
 
     def with_data(self, data: bytes) -> "Frame":
         """The same frame with another payload of the same length."""

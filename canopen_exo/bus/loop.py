@@ -6,10 +6,10 @@ buses arbitrate. No clock is read: the same nodes give the same trace on every m
 
 from typing import Final, final
 
+from canopen_exo.bus.frame import Frame
 from canopen_exo.bus.medium import Listener, Medium, Transmission
 from canopen_exo.bus.node import NEVER, Node, Out
 from canopen_exo.errors import CanopenExoError
-from canopen_exo.bus.frame import Frame
 
 
 @final
@@ -48,7 +48,7 @@ class Loop:
             self._listen(medium)
 
     def _listen(self, medium: Medium) -> None:
-        """Who hears each sender: every other node once, on the first of its ports that is not the sender."""
+        """Who hears each sender: every node once, on the first of its ports there that is not the sender."""
         for number in range(len(medium.ports)):
             listeners: list[Listener] = []
             for node, out in zip(self.nodes, self.outs, strict=True):
@@ -60,41 +60,56 @@ class Loop:
 
     def run_until(self, until: int) -> None:
         """Serve every instant up to and including `until` [ns]."""
-        media, nodes, outs = self.media, self.nodes, self.outs
+        media = self.media
         trace = self.trace
+        for medium in media:  # queued between two calls, or the cable was mended
+            if medium.waiting and medium.end == NEVER:
+                medium.arbitrate(self.now)
+        wake = self._first_wake()
+        if wake < self.now:
+            raise CanopenExoError(f"loop: a node asks to be woken at {wake} ns, it is {self.now} ns; wake_at must move on")
         while True:
-            now = NEVER
+            now = wake
             for medium in media:
                 if medium.end < now:
                     now = medium.end
-                if medium.waiting and medium.end == NEVER and not medium.is_cut:
-                    now = self.now  # queued from outside the loop, or the cable was mended
-            for node in nodes:
-                if node.wake_at < now:
-                    now = node.wake_at
             if now > until:
                 self.now = until
                 return
-            if now < self.now:
-                raise CanopenExoError(f"loop: an event at {now} ns lies before {self.now} ns; wake_at must move on")
-            self.now = now
             for medium in media:
                 if medium.end == now:
-                    frame = medium.finish()
-                    sender = medium.sender
-                    trace.append(Transmission(now, medium.index, frame, sender))
-                    for listener in medium.ports[sender].listeners:
-                        listener.node.receive(now, listener.port, frame, listener.out)
-            index = 0
-            for node in nodes:
-                if node.wake_at <= now:
-                    node.wake(now, outs[index])
-                    if node.wake_at <= now:
-                        raise CanopenExoError(
-                            f"loop: node {index} ({type(node).__name__}) asks to be woken at {node.wake_at} ns again, "
-                            f"it is {now} ns; wake() must move wake_at on"
-                        )
-                index += 1
+                    frame = medium.frame
+                    assert frame is not None
+                    medium.end = NEVER
+                    trace.append(Transmission(now, medium.index, frame, medium.sender))
+                    for listener in medium.ports[medium.sender].listeners:
+                        node = listener.node
+                        node.receive(now, listener.port, frame, listener.out)
+                        if node.wake_at < wake:
+                            wake = node.wake_at
+            if wake <= now:
+                wake = self._wake(now)
             for medium in media:
                 if medium.waiting and medium.end == NEVER:
                     medium.arbitrate(now)
+
+    def _first_wake(self) -> int:
+        wake = NEVER
+        for node in self.nodes:
+            if node.wake_at < wake:
+                wake = node.wake_at
+        return wake
+
+    def _wake(self, now: int) -> int:
+        """Wake the nodes that are due, by index; returns when the next one is."""
+        index = 0
+        for node in self.nodes:
+            if node.wake_at <= now:
+                node.wake(now, self.outs[index])
+                if node.wake_at <= now:
+                    raise CanopenExoError(
+                        f"loop: node {index} ({type(node).__name__}) asks to be woken at {node.wake_at} ns again, "
+                        f"it is {now} ns; wake() must move wake_at on"
+                    )
+            index += 1
+        return self._first_wake()

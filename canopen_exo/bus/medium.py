@@ -46,14 +46,14 @@ class Listener:
 
 @final
 class Port:
-    """One CAN controller on the medium: its transmit queue, lowest arbitration bits first."""
+    """One CAN controller on the medium. queued: frames in its transmit queue; dropped: frames a full queue refused."""
 
-    __slots__ = ("dropped", "listeners", "node", "queue")
+    __slots__ = ("dropped", "listeners", "node", "queued")
 
     def __init__(self, node: Node) -> None:
         self.node: Final[Node] = node
-        self.queue: list[Frame] = []
         self.listeners: list[Listener] = []
+        self.queued: int = 0
         self.dropped: int = 0
 
 
@@ -61,7 +61,10 @@ class Port:
 class Medium:
     """A bus of a given bit rate. name: for traces and results; index: place in the loop's order.
 
-    end: when the frame on the wire ends, NEVER while idle. busy_ns, frames: totals so far.
+    end: when the frame on the wire ends, NEVER while idle. frame, sender: what is on the wire and whose it is.
+    waiting: the frames of all transmit queues in the order in which they will win; busy_ns, frames: totals so far.
+    Each controller offers its lowest arbitration bits first, so one list in order of arbitration (then of arrival)
+    holds all queues; `senders` goes with it.
     """
 
     def __init__(self, name: str, index: int, bitrate: int) -> None:
@@ -74,7 +77,8 @@ class Medium:
         self.index: Final[int] = index
         self.bit_ns: Final[int] = SECOND // bitrate
         self.ports: list[Port] = []
-        self.waiting: int = 0
+        self.waiting: list[Frame] = []
+        self.senders: list[int] = []
         self.end: int = NEVER
         self.frame: Frame | None = None
         self.sender: int = 0
@@ -93,52 +97,40 @@ class Medium:
         if frame.flags & FLAG_FD:
             raise CanopenExoError(f"medium {self.name!r}: CAN FD frame {frame!r} given; this bus is classical CAN")
         sender = self.ports[port]
-        queue = sender.queue
-        if len(queue) >= QUEUE_LENGTH:
+        if sender.queued >= QUEUE_LENGTH:
             sender.dropped += 1
             return
-        at = len(queue)
-        arbitration = frame.arbitration
-        while at and queue[at - 1].arbitration > arbitration:
-            at -= 1
-        queue.insert(at, frame)
-        self.waiting += 1
+        sender.queued += 1
+        waiting = self.waiting
+        if waiting and waiting[-1].arbitration > frame.arbitration:
+            at = len(waiting) - 1
+            arbitration = frame.arbitration
+            while at and waiting[at - 1].arbitration > arbitration:
+                at -= 1
+            waiting.insert(at, frame)
+            self.senders.insert(at, port)
+        else:
+            waiting.append(frame)
+            self.senders.append(port)
 
     def arbitrate(self, now: int) -> None:
-        """Start the winning frame, when the bus is idle, whole, and a frame waits."""
-        if self.end != NEVER or self.is_cut:
+        """Start the winning frame. The bus must be idle and a frame must wait; a cut bus starts nothing."""
+        if self.is_cut:
             return
-        best = 1 << 40
-        winner = -1
-        number = 0
-        for port in self.ports:
-            if port.queue:
-                arbitration = port.queue[0].arbitration
-                if arbitration < best:
-                    best = arbitration
-                    winner = number
-                elif arbitration == best:
-                    self.collisions += 1
-            number += 1
-        if winner < 0:
-            return
-        frame = self.ports[winner].queue.pop(0)
-        self.waiting -= 1
+        frame = self.waiting.pop(0)
+        sender = self.senders.pop(0)
+        self.ports[sender].queued -= 1
+        if self.waiting and self.waiting[0].arbitration == frame.arbitration and self.senders[0] != sender:
+            self.collisions += 1
+        bits = frame.bits
+        if bits == 0:
+            bits = frame.measure()
         self.frame = frame
-        self.sender = winner
-        duration = frame.bits * self.bit_ns
-        self.busy_ns += duration
+        self.sender = sender
         self.frames += 1
+        duration = bits * self.bit_ns
+        self.busy_ns += duration
         self.end = now + duration
-
-    def finish(self) -> Frame:
-        """Take the frame that ends now off the wire."""
-        frame = self.frame
-        if frame is None:
-            raise CanopenExoError(f"medium {self.name!r}: no frame is on the wire")
-        self.frame = None
-        self.end = NEVER
-        return frame
 
     def cut(self) -> None:
         """Break the cable: the frame on the wire is lost, queues fill up, nothing passes until `mend`."""

@@ -128,7 +128,7 @@ USER_75KG: Final = BodyParams(
 
 @dataclass(frozen=True, slots=True)
 class Inertial:
-    """A rigid body of user and exoskeleton segment: centre of mass (x, z) in the body frame [m], inertia about it [kg m2]."""
+    """User and exoskeleton segment as one: centre of mass (x, z) in the body frame [m], inertia about it [kg m2]."""
 
     mass_kg: float
     x: float
