@@ -1,0 +1,65 @@
+"""Effects: how long an activation lasts, and whether the injector arms itself again.
+
+Source: Fabarisov et al., ESREL 2020 (FIBlock), "effect". Durations are int ns; windows are half-open [t0, t0 + D).
+"""
+
+from typing import Final, final
+
+from mypy_extensions import mypyc_attr
+
+from canopen_exo.bus.node import NEVER
+from fi_gateway.errors import FaultError
+
+
+@mypyc_attr(allow_interpreted_subclasses=True)
+class Effect:
+    """How long an activation lasts.
+
+    frames: it ends after this many frames the fault acted on, 0 for no limit; rearms: whether the injector waits for
+    its event or trigger again afterwards, or is spent for the run.
+    """
+
+    def __init__(self, frames: int = 0, rearms: bool = False) -> None:
+        self.frames: int = frames
+        self.rearms: bool = rearms
+
+    def duration(self) -> int:
+        """Length of the activation that starts now, ns, NEVER for no limit; drawn anew for each activation."""
+        return NEVER
+
+
+@final
+class Once(Effect):
+    """One frame, once a run. FIBlock: Once."""
+
+    def __init__(self) -> None:
+        super().__init__(1, False)
+
+
+@final
+class ConstantTime(Effect):
+    """A fixed time, ns, > 0; then the injector arms again.
+
+    FIBlock: Constant time; there the window is a number of samples, and its last one is clean.
+    """
+
+    def __init__(self, duration_ns: int) -> None:
+        super().__init__(0, True)
+        if not 0 < duration_ns < NEVER:
+            raise FaultError(f"constant_time: duration {duration_ns} ns given, allowed 1..{NEVER - 1} ns")
+        self._duration_ns: Final[int] = duration_ns
+
+    def duration(self) -> int:
+        """The fixed time, ns."""
+        return self._duration_ns
+
+    def __reduce__(self) -> tuple[type["ConstantTime"], tuple[int]]:
+        return ConstantTime, (self._duration_ns,)
+
+
+@final
+class Infinite(Effect):
+    """Until the end of the run. FIBlock: Infinite time."""
+
+    def __init__(self) -> None:
+        super().__init__(0, False)

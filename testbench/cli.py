@@ -1,0 +1,187 @@
+"""The command line: `exo-hil`.
+
+stdout carries the result, stderr the talk. Exit codes: 0 pass, 1 verdict fail, 2 usage or bad file, 3 run invalid.
+Everything heavy is imported by the verb that needs it.
+"""
+
+import argparse
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Final
+
+PASS: Final = 0
+FAIL: Final = 1
+USAGE: Final = 2
+INVALID: Final = 3
+INTERRUPTED: Final = 130
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one verb; returns the exit code."""
+    options = _parser().parse_args(arguments)
+    verb: Callable[[argparse.Namespace], int] = options.verb
+    try:
+        return verb(options)
+    except KeyboardInterrupt:
+        _say("interrupted; nothing was written")
+        return INTERRUPTED
+    except BrokenPipeError:
+        sys.stderr.close()  # the reader of our output has left; so do we
+        return PASS
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="exo-hil",
+        description="CAN-bus hardware-in-the-loop emulator of a lower-limb exoskeleton with wire-level fault injection.",
+        epilog="Exit codes: 0 pass, 1 verdict fail, 2 usage or bad file, 3 run invalid.",
+    )
+    parser.add_argument("--version", action=_Version, nargs=0, help="print the version and leave")
+    verbs = parser.add_subparsers(title="verbs", metavar="VERB", required=True)
+
+    run = verbs.add_parser("run", help="golden run + faulted run, verdict", description=_run.__doc__)
+    run.add_argument("scenario", type=Path, metavar="SCENARIO.yaml")
+    run.add_argument("--seed", metavar="N", help="instead of the scenario's seed")
+    run.add_argument("--out", type=Path, metavar="DIR", help="result folder (default: results/NAME-SEED)")
+    run.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        dest="overrides",
+        help="change the scenario, as in injectors.freeze_position.effect.duration=0.5s; may be repeated",
+    )
+    run.add_argument("--json", action="store_true", help="print the result as one JSON document")
+    run.set_defaults(verb=_run)
+
+    check = verbs.add_parser("check", help="validate a scenario and say what it will do", description=_check.__doc__)
+    check.add_argument("scenario", type=Path, metavar="FILE")
+    check.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="overrides", help="as for run")
+    check.set_defaults(verb=_check)
+
+    export = verbs.add_parser("export", help="write files for other tools", description=_export.__doc__)
+    export.add_argument("what", choices=("eds", "dbc", "schema"))
+    export.set_defaults(verb=_export)
+    return parser
+
+
+class _Version(argparse.Action):
+    """`--version`, looking the version up only when asked."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: object,
+        option_string: str | None = None,
+    ) -> None:
+        from importlib.metadata import version
+
+        print(f"exo-hil {version('exo-hil')}")
+        parser.exit()
+
+
+def _run(options: argparse.Namespace) -> int:
+    """Run a scenario in virtual time: a golden run without faults, a run with them, and a verdict on the pair."""
+    from fi_gateway.marked_yaml import FileErrors
+    from testbench.errors import BenchError
+    from testbench.scenario import load_scenario
+    from testbench.store import check_folder, default_folder, result_files, write_result
+    from testbench.summary import summary_json, summary_text
+
+    overrides = list(options.overrides)
+    if options.seed is not None:
+        overrides.append(f"seed={options.seed}")
+    try:
+        scenario = load_scenario(options.scenario, overrides)
+        folder = options.out or default_folder(scenario.name, scenario.seed)
+        check_folder(folder)
+    except (FileErrors, BenchError) as error:
+        _say(str(error))
+        return USAGE
+    for warning in scenario.warnings:
+        _say(f"warning: {warning}")
+
+    from hlc.limits import limits_of
+    from joint_emulators.errors import JointEmulatorError
+    from testbench.report import Plotted, plot_files
+    from testbench.run import NotStarted, run_scenario
+
+    try:
+        with _progress(scenario.name) as progress:
+            result = run_scenario(scenario, progress)
+    except (NotStarted, JointEmulatorError) as error:
+        _say(f"{scenario.name}: run invalid: {error}")
+        return INVALID
+    names = tuple(joint.name for joint in scenario.plan.joints)
+    limits = {name: limits_of(name) for name in names}
+    title = f"{scenario.name}, seed {scenario.seed}"
+    files = result_files(scenario.resolved_yaml(), result.document, names, result.golden, result.faulted)
+    files.update(plot_files(Plotted(title, names, limits, result.golden, result.faulted, result.judgement)))
+    try:
+        written = write_result(folder, files)
+    except BenchError as error:
+        _say(str(error))
+        return USAGE
+    print(summary_json(result.document) if options.json else summary_text(result.document), end="")
+    _say(f"result folder: {written}")
+    if not result.document["valid"]:
+        return INVALID
+    return PASS if result.judgement.passed else FAIL
+
+
+def _check(options: argparse.Namespace) -> int:
+    """Validate a scenario file and say in words what it will do; nothing is run."""
+    from fi_gateway.marked_yaml import FileErrors
+    from testbench.scenario import describe, load_scenario
+
+    try:
+        scenario = load_scenario(options.scenario, options.overrides)
+    except FileErrors as error:
+        _say(str(error))
+        return USAGE
+    print("\n".join(describe(scenario)))
+    for warning in scenario.warnings:
+        _say(f"warning: {warning}")
+    return PASS
+
+
+def _export(options: argparse.Namespace) -> int:
+    """Print the joint controllers' EDS, the bus as DBC, or the JSON Schema of scenario files."""
+    if options.what == "schema":
+        import json
+
+        from testbench.scenario import scenario_schema
+
+        print(json.dumps(scenario_schema(), indent=2))
+        return PASS
+    from importlib.resources import files
+
+    name = {"eds": "exo_joint.eds", "dbc": "exo.dbc"}[options.what]
+    sys.stdout.write((files("dbc") / name).read_text(encoding="utf-8"))
+    return PASS
+
+
+@contextmanager
+def _progress(name: str) -> Iterator[Callable[[float], None]]:
+    """A progress bar on stderr, when that is a terminal."""
+    if not sys.stderr.isatty():
+        yield lambda share: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:3.0f} %"), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(name, total=1.0)
+        yield lambda share: bar.update(task, completed=share)
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,184 @@
+"""One scenario, run: the golden run, the faulted run, and what is said about the pair.
+
+Both runs build the same rig anew in virtual time; they differ in the injectors only, so that every difference between
+them comes from the faults.
+"""
+
+import gc
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from canopen_exo.bus.medium import Medium
+from canopen_exo.bus.node import MS, NEVER, SECOND
+from fi_gateway.injector import Injector
+from fi_gateway.schema import build_injectors
+from hlc.limits import limits_of
+from hlc.node import Phase
+from testbench.errors import BenchError
+from testbench.record import BusStats, Commands, RigEvent, RunRecord, Truth
+from testbench.rig import Rig, RigParams, build_rig
+from testbench.scenario import Scenario
+from testbench.summary import Summary, summary_document
+from testbench.verdict import Judgement, judge
+
+CHUNK_NS: Final = 50 * MS
+"""How far the loop runs between two looks at the rig."""
+
+START_NS: Final = 6 * SECOND
+"""Most that power-up, configuration and enabling may take; their own time-outs are shorter."""
+
+LEAVE_NS: Final = SECOND
+"""Most that disabling may take after the motion."""
+
+Progress = Callable[[float], None]
+"""Told the share 0..1 of the work that is done."""
+
+
+class NotStarted(BenchError):
+    """The motion never began, so there is nothing to judge; the message says why."""
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """A scenario run and judged. The document is what `exo-hil run --json` prints."""
+
+    scenario: Scenario
+    golden: RunRecord
+    faulted: RunRecord
+    judgement: Judgement
+    document: Summary
+
+
+def run_scenario(scenario: Scenario, progress: Progress = lambda share: None) -> Result:
+    """Golden run, faulted run, verdict. Raises NotStarted when the motion of either never begins."""
+    started = time.perf_counter()
+    params = rig_params(scenario)
+    golden, golden_ns = run_rig(params, [], lambda share: progress(0.5 * share))
+    injectors = build_injectors(scenario.injectors, params.plan, scenario.seed, 0)
+    faulted, faulted_ns = run_rig(params, injectors, lambda share: progress(0.5 + 0.5 * share))
+    names = tuple(joint.name for joint in params.plan.joints)
+    judgement = judge(
+        names,
+        {name: limits_of(name) for name in names},
+        golden,
+        faulted,
+        tolerance_rad=scenario.tolerance_rad,
+        fail_on=scenario.fail_on,
+        expectations=scenario.expect,
+    )
+    document = summary_document(
+        scenario.name,
+        scenario.seed,
+        golden,
+        faulted,
+        judgement,
+        sim_time_s=(golden_ns + faulted_ns) / 1e9,
+        wall_time_s=time.perf_counter() - started,
+    )
+    return Result(scenario, golden, faulted, judgement, document)
+
+
+def rig_params(scenario: Scenario) -> RigParams:
+    """What a scenario asks of the rig."""
+    return RigParams(scenario.plan, scenario.rig.stops, scenario.motion.stride_ns, scenario.motion.duration_ns)
+
+
+def run_rig(
+    params: RigParams, injectors: list[Injector], progress: Progress = lambda share: None
+) -> tuple[RunRecord, int]:
+    """One run from power-up to disabled drives; the record and the time simulated [ns]. Raises NotStarted."""
+    rig = build_rig(params, injectors)
+    collecting = gc.isenabled()
+    gc.disable()  # nothing in a run makes cycles of references; looking for them costs a fifth of the time
+    try:
+        drive_through(rig, progress)
+    finally:
+        if collecting:
+            gc.enable()
+    return record_of(rig), rig.loop.now
+
+
+def drive_through(rig: Rig, progress: Progress) -> None:
+    """Run the loop until the motion time is over and the drives are left; always ends."""
+    controller, loop, params = rig.controller, rig.loop, rig.params
+    latest = START_NS + params.stride_ns + params.duration_ns + LEAVE_NS
+    while loop.now < latest:
+        loop.run_until(loop.now + CHUNK_NS)
+        phase = controller.phase
+        if phase is Phase.FAILED:
+            break
+        if phase is Phase.STOPPED and loop.now > controller.time_zero + params.duration_ns:
+            break
+        if phase is Phase.STOPPED and controller.time_zero == NEVER:
+            break
+        progress(min(1.0, loop.now / (latest - START_NS)))
+    rig.gateway.finish(loop.now)
+    progress(1.0)
+
+
+def record_of(rig: Rig) -> RunRecord:
+    """What a finished run leaves behind; raises NotStarted when the motion never began."""
+    controller, params = rig.controller, rig.params
+    zero = controller.time_zero
+    if zero == NEVER or rig.gateway.time_zero == NEVER or not controller.samples:
+        reasons = "; ".join(f"{event.joint + ': ' if event.joint else ''}{event.text}" for event in controller.events)
+        raise NotStarted(f"the motion never began: {reasons or 'the bus carried no status of the controller'}")
+    rows = [row for row in rig.rack.truth if zero <= row.time_ns <= zero + params.duration_ns]
+    truth = Truth(
+        np.array([row.time_ns - zero for row in rows]) / 1e9,
+        np.array([row.q for row in rows]),
+        np.array([row.dq for row in rows]),
+        np.array([row.tau for row in rows]),
+    )
+    samples = controller.samples
+    commands = Commands(
+        np.array([sample.cycle * params.plan.cycle_ns for sample in samples]) / 1e9,
+        np.array([sample.q_d for sample in samples]),
+        np.array([sample.dq_d for sample in samples]),
+        np.array([sample.tau_command for sample in samples]),
+    )
+    media = (rig.controller_bus, rig.drive_bus)
+    return RunRecord(
+        rows=rig.loop.trace,
+        time0_ns=rig.gateway.time_zero,
+        duration_ns=params.duration_ns,
+        truth=truth,
+        commands=commands,
+        activations=rig.gateway.records,
+        buses=tuple(_stats(rig, medium) for medium in media),
+        notes=[
+            RigEvent((event.time_ns - zero) / 1e9, event.joint or "HLC", event.kind, event.text)
+            for event in controller.events
+        ],
+        invalid_reasons=_invalid_reasons(rig),
+    )
+
+
+def _stats(rig: Rig, medium: Medium) -> BusStats:
+    """Frames that ended within the motion, and the share of it that they lasted."""
+    start = rig.controller.time_zero
+    end = start + rig.params.duration_ns
+    frames, busy_ns = 0, 0
+    for row in rig.loop.trace:
+        if row.bus == medium.index and start < row.end_ns <= end:
+            frames += 1
+            busy_ns += row.frame.bits * medium.bit_ns
+    return BusStats(medium.name, frames, busy_ns / (end - start), sum(port.dropped for port in medium.ports))
+
+
+def _invalid_reasons(rig: Rig) -> list[str]:
+    """Why the run proves nothing: frames lost without a fault, two senders with one id."""
+    reasons = []
+    for medium in (rig.controller_bus, rig.drive_bus):
+        dropped = sum(port.dropped for port in medium.ports)
+        if dropped:
+            reasons.append(f"{medium.name} bus: {dropped} frames lost in full transmit queues")
+        if medium.collisions:
+            reasons.append(f"{medium.name} bus: two senders with the same CAN id at once, {medium.collisions} times")
+    if not rig.gateway.injectors and not rig.controller.completed:
+        reasons.append("the motion was given up without a fault")
+    return reasons

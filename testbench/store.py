@@ -1,0 +1,235 @@
+"""The result folder: written whole, or not at all.
+
+Everything is written into a new folder beside the target (`.<name>.<n>.part`), flushed to the disk, and put in place by
+renaming. A previous result is moved aside first and removed last; anything else that stands there is left alone and
+refused. When writing fails or is interrupted, the half-written folder is removed and the previous result is back.
+After a power cut between the two renames the previous result is left in `.<name>.<n>.old`, whole.
+"""
+
+import os
+import re
+import shutil
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Final
+
+from canopen_exo.bus.trace import write_candump
+from testbench.errors import BenchError
+from testbench.record import Array, RunRecord
+from testbench.summary import Summary, summary_json
+
+Writer = Callable[[Path], None]
+"""Writes one file at the path given."""
+
+SCENARIO_FILE: Final = "scenario.yaml"
+SUMMARY_FILE: Final = "summary.json"
+
+FILES: Final = frozenset(
+    {
+        SCENARIO_FILE,
+        SUMMARY_FILE,
+        *("controller.log", "drive.log", "golden_controller.log", "golden_drive.log"),
+        *("golden.parquet", "faulted.parquet", "golden_commands.parquet", "faulted_commands.parquet"),
+        *("fault.png", "joints.png"),
+    }
+)
+"""What a result folder may hold; a folder with anything else in it is somebody's, and never replaced."""
+
+
+def default_folder(name: str, seed: int) -> Path:
+    """`results/<name>-<seed>`, whatever letters the scenario's name has."""
+    plain = re.sub(r"[^A-Za-z0-9._-]+", "_", name).lstrip(".")[:100] or "scenario"
+    return Path("results") / f"{plain}-{seed}"
+
+
+def result_files(
+    scenario_yaml: str, document: Summary, joints: tuple[str, ...], golden: RunRecord, faulted: RunRecord
+) -> dict[str, Writer]:
+    """File name -> writer for everything but the plots (testbench.report)."""
+    text = summary_json(document)
+    files: dict[str, Writer] = {
+        SCENARIO_FILE: lambda path: _write_text(path, scenario_yaml),
+        SUMMARY_FILE: lambda path: _write_text(path, text),
+    }
+    for name, run in (("golden", golden), ("faulted", faulted)):
+        for index, bus in enumerate(run.buses):
+            log = f"{bus.name}.log" if name == "faulted" else f"golden_{bus.name}.log"
+            files[log] = _log_writer(run, index, bus.name)
+        files[f"{name}.parquet"] = _truth_writer(joints, run)
+        files[f"{name}_commands.parquet"] = _commands_writer(joints, run)
+    return files
+
+
+def check_folder(folder: Path) -> None:
+    """Raise BenchError when a result cannot be put there; call it before the run, not after.
+
+    Allowed: nothing there yet, an empty folder, or a previous result and nothing else.
+    """
+    folder = _resolved(folder)
+    try:
+        if not folder.exists():
+            for parent in folder.parents:
+                if parent.exists():
+                    _check_parent(folder, parent)
+                    return
+        if not folder.is_dir():
+            raise BenchError(f"result folder {folder}: a file is there; give another place with --out")
+        _check_parent(folder, folder.parent)
+        names = sorted(entry.name for entry in folder.iterdir())
+    except OSError as error:
+        raise BenchError(f"result folder {folder}: {_reason(error)}; give another place with --out") from error
+    if not names:
+        return
+    strange = [name for name in names if name not in FILES]
+    if SUMMARY_FILE not in names or SCENARIO_FILE not in names or strange:
+        found = strange[0] if strange else names[0]
+        raise BenchError(
+            f"result folder {folder}: it holds {found!r} and is not, or not only, a previous result; nothing was "
+            "changed: move it away, or give another place with --out"
+        )
+
+
+def write_result(folder: Path, files: Mapping[str, Writer]) -> Path:
+    """Put the files into `folder`, whole or not at all; returns the folder as it was resolved.
+
+    A previous result there is replaced. Raises BenchError when the place is refused or cannot be written.
+    """
+    unknown = sorted(set(files) - FILES)
+    if unknown:
+        raise BenchError(f"result folder {folder}: file {unknown[0]!r} given, allowed are {', '.join(sorted(FILES))}")
+    check_folder(folder)
+    folder = _resolved(folder)
+    try:
+        with _parents(folder.parent):
+            part = _new_folder(folder, "part")
+            try:
+                for name, write in files.items():
+                    write(part / name)
+                    _flush(part / name)
+                _flush_folder(part)
+                _swap(part, folder)
+            finally:
+                shutil.rmtree(part, ignore_errors=True)
+    except OSError as error:
+        raise BenchError(
+            f"result folder {folder}: cannot be written: {_reason(error)}; nothing was left there: make room, or "
+            "give another place with --out"
+        ) from error
+    return folder
+
+
+def _swap(part: Path, folder: Path) -> None:
+    """Put `part` in the place of `folder`; whatever fails, what stood there stands there again."""
+    aside: Path | None = None
+    try:
+        if folder.exists():
+            aside = _new_folder(folder, "old")
+            folder.rename(aside / folder.name)
+        part.rename(folder)
+    finally:
+        if aside is not None:
+            if not folder.exists():
+                (aside / folder.name).rename(folder)
+            shutil.rmtree(aside, ignore_errors=True)
+    _flush_folder(folder.parent)
+
+
+@contextmanager
+def _parents(parent: Path) -> Iterator[None]:
+    """Make the folders above; take away again those that were made, when what follows fails."""
+    made: list[Path] = []
+    try:
+        for above in [*reversed(parent.parents), parent]:
+            if not above.exists():
+                above.mkdir(exist_ok=True)
+                made.append(above)
+        yield
+    except BaseException:
+        for above in reversed(made):
+            with suppress(OSError):  # somebody else's file came into it meanwhile
+                above.rmdir()
+        raise
+
+
+def _new_folder(folder: Path, end: str) -> Path:
+    """A new folder beside `folder`, with the usual permissions; nobody else gets the same."""
+    number = 0
+    while True:
+        made = folder.with_name(f".{folder.name}.{number}.{end}")
+        try:
+            made.mkdir()
+        except FileExistsError:
+            number += 1
+        else:
+            return made
+
+
+def _resolved(folder: Path) -> Path:
+    """The folder itself, whatever links lead to it: the link stays, what it names is replaced."""
+    return Path(os.path.realpath(folder))
+
+
+def _check_parent(folder: Path, parent: Path) -> None:
+    if not parent.is_dir():
+        raise BenchError(f"result folder {folder}: {parent} is a file; give another place with --out")
+    if not os.access(parent, os.W_OK | os.X_OK):
+        raise BenchError(f"result folder {folder}: no permission to write in {parent}; give another place with --out")
+
+
+def _reason(error: OSError) -> str:
+    return error.strerror or str(error)
+
+
+def _flush(path: Path) -> None:
+    """Have the system put a file on the disk."""
+    with path.open("rb+") as file:
+        os.fsync(file.fileno())
+
+
+def _flush_folder(path: Path) -> None:
+    """Have the system put a folder's list of names on the disk, where it can (not on Windows)."""
+    with suppress(OSError):
+        handle = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
+
+
+def _write_text(path: Path, text: str) -> None:
+    path.write_text(text, encoding="utf-8", newline="\n")
+
+
+def _log_writer(run: RunRecord, index: int, name: str) -> Writer:
+    return lambda path: write_candump(path, run.rows, index, name)
+
+
+def _truth_writer(joints: tuple[str, ...], run: RunRecord) -> Writer:
+    truth = run.truth
+    columns = (("q", "rad", truth.q), ("dq", "rad/s", truth.dq), ("tau", "N m", truth.tau))
+    about = "plant truth at 1 kHz: joint angle, joint speed, joint torque after the gear"
+    return lambda path: _write_parquet(path, joints, truth.t_s, columns, about)
+
+
+def _commands_writer(joints: tuple[str, ...], run: RunRecord) -> Writer:
+    said = run.commands
+    columns = (("q_ref", "rad", said.q_ref), ("dq_ref", "rad/s", said.dq_ref), ("tau_command", "N m", said.tau_command))
+    about = "high-level controller at its rate: reference angle and speed, torque command before the clamp"
+    return lambda path: _write_parquet(path, joints, said.t_s, columns, about)
+
+
+def _write_parquet(
+    path: Path, joints: tuple[str, ...], t_s: Array, columns: tuple[tuple[str, str, Array], ...], about: str
+) -> None:
+    """Columns time_s and <joint>.<quantity>, unit in each field's metadata. Imports pyarrow."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    fields, arrays = [pa.field("time_s", pa.float64(), False, {"unit": "s", "zero": "time 0"})], [pa.array(t_s)]
+    for k, joint in enumerate(joints):
+        for name, unit, values in columns:
+            fields.append(pa.field(f"{joint}.{name}", pa.float64(), False, {"unit": unit}))
+            arrays.append(pa.array(values[:, k]))
+    table = pa.Table.from_arrays(arrays, schema=pa.schema(fields, {"about": about}))
+    pq.write_table(table, path, compression="zstd")

@@ -1,0 +1,358 @@
+"""The result of a scenario as one JSON document, and as a short text for the terminal.
+
+The document is the contract of `exo-hil run --json` and of summary.json in the result folder; keys may be added, none
+changes its meaning. It is strict JSON: a number that is not finite raises, it is never written as NaN or null.
+Times in it are seconds from time 0. `joints` compares plant truth, never frames.
+"""
+
+import json
+import platform
+from collections.abc import Sequence
+from importlib import metadata
+from math import isfinite
+from typing import Final, TypedDict
+
+from canopen_exo.bus.frame import Frame
+from canopen_exo.bus.node import NEVER
+from canopen_exo.bus.trace import candump_frame, trace_hash
+from fi_gateway.injector import Activation
+from testbench.errors import BenchError
+from testbench.golden import JointComparison
+from testbench.record import RunRecord
+from testbench.verdict import UNITS, Judgement, Violation
+
+MOST_LINES: Final = 25
+"""Lines of `summary_text`: what fits on a small terminal with the prompt."""
+
+
+class BusEntry(TypedDict):
+    """One bus over the motion of the faulted run; load 0..1."""
+
+    frames: int
+    load: float
+    queue_overflows: int
+
+
+class HashEntry(TypedDict):
+    """SHA-256 of both traces."""
+
+    golden: str
+    faulted: str
+
+
+class InjectionEntry(TypedDict):
+    """One activation. end_s: None when its window had no end; frames: changed or lost; first_*: as in a candump log."""
+
+    injector: str
+    index: int
+    start_s: float
+    end_s: float | None
+    frames: int
+    frames_seen: int
+    signal: str
+    cause: str
+    first_before: str | None
+    first_after: str | None
+
+
+class CountEntry(TypedDict):
+    """activated: windows opened; injected: frames the fault acted on; manifested: frames that really changed."""
+
+    activated: int
+    injected: int
+    manifested: int
+
+
+class JointEntry(TypedDict):
+    """Faulted against golden run, and extremes of the faulted run, over the motion."""
+
+    rmse_position_rad: float
+    rmse_velocity_rad_s: float
+    rmse_torque_nm: float
+    min_angle_deg: float
+    max_angle_deg: float
+    max_speed_rpm: float
+    max_torque_nm: float
+
+
+class ViolationEntry(TypedDict):
+    """A joint beyond a limit; value and limit in the unit of the kind: N m, rpm, deg."""
+
+    joint: str
+    kind: str
+    time_s: float
+    value: float
+    limit: float
+
+
+class GoldenEntry(TypedDict):
+    """The golden run by itself."""
+
+    tracking_rmse_rad: dict[str, float]
+    errors: list[ViolationEntry]
+    failures: list[ViolationEntry]
+
+
+class ExpectationEntry(TypedDict):
+    """One `expect:` line; found in SI."""
+
+    text: str
+    found: float
+    met: bool
+
+
+class EventEntry(TypedDict):
+    """Something that happened on the rig in the faulted run."""
+
+    time_s: float
+    node: str
+    kind: str
+    text: str
+
+
+class Summary(TypedDict):
+    """The whole document."""
+
+    scenario: str
+    seed: int
+    valid: bool
+    invalid_reasons: list[str]
+    verdict: str
+    outcome: str
+    sim_time_s: float
+    wall_time_s: float
+    x_realtime: float
+    time0_s: float
+    duration_s: float
+    tolerance_deg: float
+    bus: dict[str, BusEntry]
+    trace_hash: HashEntry
+    counts: CountEntry
+    injections: list[InjectionEntry]
+    joints: dict[str, JointEntry]
+    golden: GoldenEntry
+    errors: list[ViolationEntry]
+    failures: list[ViolationEntry]
+    failures_at_3deg: list[ViolationEntry]
+    expectations: list[ExpectationEntry]
+    events: list[EventEntry]
+    versions: dict[str, str]
+
+
+def summary_document(
+    scenario: str,
+    seed: int,
+    golden: RunRecord,
+    faulted: RunRecord,
+    judgement: Judgement,
+    *,
+    sim_time_s: float,
+    wall_time_s: float,
+) -> Summary:
+    """The document of a judged pair of runs. sim_time_s, wall_time_s: of all runs made for it.
+
+    Raises BenchError when any number is not finite.
+    """
+    document: Summary = {
+        "scenario": scenario,
+        "seed": seed,
+        "valid": golden.valid and faulted.valid,
+        "invalid_reasons": [f"golden run: {reason}" for reason in golden.invalid_reasons]
+        + [f"faulted run: {reason}" for reason in faulted.invalid_reasons],
+        "verdict": "pass" if judgement.passed else "fail",
+        "outcome": judgement.outcome,
+        "sim_time_s": sim_time_s,
+        "wall_time_s": wall_time_s,
+        "x_realtime": sim_time_s / wall_time_s if wall_time_s > 0 else 0.0,
+        "time0_s": faulted.time0_ns / 1e9,
+        "duration_s": faulted.duration_s,
+        "tolerance_deg": judgement.tolerance_deg,
+        "bus": {
+            bus.name: {"frames": bus.frames, "load": bus.load, "queue_overflows": bus.queue_overflows}
+            for bus in faulted.buses
+        },
+        "trace_hash": {"golden": trace_hash(golden.rows), "faulted": trace_hash(faulted.rows)},
+        "counts": _counts(faulted.activations),
+        "injections": [_injection(activation, faulted.time0_ns) for activation in faulted.activations],
+        "joints": {joint: _joint(one) for joint, one in judgement.comparison.items()},
+        "golden": {
+            "tracking_rmse_rad": dict(judgement.tracking_rmse_rad),
+            "errors": _violations(judgement.golden_errors),
+            "failures": _violations(judgement.golden_failures),
+        },
+        "errors": _violations(judgement.errors),
+        "failures": _violations(judgement.failures),
+        "failures_at_3deg": _violations(judgement.failures_at_3deg),
+        "expectations": [{"text": one.text, "found": one.found, "met": one.met} for one in judgement.expectations],
+        "events": [
+            {"time_s": one.time_s, "node": one.node, "kind": one.kind, "text": one.text} for one in faulted.notes
+        ],
+        "versions": versions(),
+    }
+    check_finite(document)
+    return document
+
+
+def summary_json(document: Summary) -> str:
+    """The document as strict JSON, two spaces a level, keys in the order of the contract."""
+    return json.dumps(document, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+
+
+def check_finite(value: object, path: str = "") -> None:
+    """Raise BenchError naming the first number of a document that JSON cannot hold."""
+    if isinstance(value, dict):
+        for key, item in value.items():
+            check_finite(item, f"{path}.{key}" if path else str(key))
+    elif isinstance(value, list | tuple):
+        for index, item in enumerate(value):
+            check_finite(item, f"{path}[{index}]")
+    elif isinstance(value, float) and not isfinite(value):
+        raise BenchError(f"summary: {path} is {value}, allowed are finite numbers; the run went wrong before it")
+
+
+def versions() -> dict[str, str]:
+    """What the numbers depend on: this project, Python, and the packages that compute; those installed."""
+    found = {"python": platform.python_version()}
+    for name in ("exo-hil", "numpy", "mujoco", "mujoco-core"):
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    return found
+
+
+def _counts(activations: Sequence[Activation]) -> CountEntry:
+    return {
+        "activated": len(activations),
+        "injected": sum(one.frames_seen - one.frames_unfit for one in activations),
+        "manifested": sum(one.frames_changed for one in activations),
+    }
+
+
+def _injection(one: Activation, time0_ns: int) -> InjectionEntry:
+    return {
+        "injector": one.injector,
+        "index": one.index,
+        "start_s": (one.start_ns - time0_ns) / 1e9,
+        "end_s": None if one.end_ns >= NEVER else (one.end_ns - time0_ns) / 1e9,
+        "frames": one.frames_changed,
+        "frames_seen": one.frames_seen,
+        "signal": one.signal,
+        "cause": one.cause,
+        "first_before": _frame(one.first_before),
+        "first_after": _frame(one.first_after),
+    }
+
+
+def _frame(frame: Frame | None) -> str | None:
+    return None if frame is None else candump_frame(frame)
+
+
+def _joint(one: JointComparison) -> JointEntry:
+    return {
+        "rmse_position_rad": one.rmse_position_rad,
+        "rmse_velocity_rad_s": one.rmse_velocity_rad_s,
+        "rmse_torque_nm": one.rmse_torque_nm,
+        "min_angle_deg": one.min_angle_deg,
+        "max_angle_deg": one.max_angle_deg,
+        "max_speed_rpm": one.max_speed_rpm,
+        "max_torque_nm": one.max_torque_nm,
+    }
+
+
+def _violations(found: Sequence[Violation]) -> list[ViolationEntry]:
+    return [
+        {"joint": one.joint, "kind": one.kind, "time_s": one.time_s, "value": one.value, "limit": one.limit}
+        for one in found
+    ]
+
+
+def summary_text(document: Summary) -> str:
+    """The document for people: at most MOST_LINES lines of plain text for six joints, columns aligned."""
+    load = ", ".join(f"{name} bus {100 * bus['load']:.0f} %" for name, bus in document["bus"].items())
+    golden = document["golden"]["tracking_rmse_rad"]
+    worst = max(golden, key=lambda joint: golden[joint])
+    head = [
+        f"{document['verdict'].upper()}  {document['scenario']}, seed {document['seed']}: {_outcome_text(document)}",
+        f"      {document['sim_time_s']:.1f} s simulated in {document['wall_time_s']:.2f} s "
+        f"({document['x_realtime']:.1f} x real time); {load}",
+        *_few([f"      {reason}" for reason in document["invalid_reasons"]], 2, "reasons"),
+    ]
+    tail = [
+        *_joint_lines(document),
+        f"golden run: tracking RMSE at most {golden[worst]:.4f} rad ({worst})",
+        *_few(_violation_lines("failure", document["failures"]), 3, "failures"),
+        *_few(_violation_lines("error", document["errors"]), 3, "errors"),
+        *_expectation_lines(document),
+    ]
+    injections = _injection_lines(document)
+    room = max(MOST_LINES - len(head) - len(tail) - 1, 1)
+    return "\n".join([*head, injections[0], *_few(injections[1:], room, "injections"), *tail]) + "\n"
+
+
+def _outcome_text(document: Summary) -> str:
+    return {
+        "invalid": "the run is invalid and proves nothing",
+        "failure": "failure, a joint went beyond its range of travel",
+        "error": "error, a torque or speed limit was exceeded",
+        "masked": "masked, faults were injected and every limit was kept",
+        "not_activated": "no fault was activated",
+    }[document["outcome"]]
+
+
+def _injection_lines(document: Summary) -> list[str]:
+    counts, injections = document["counts"], document["injections"]
+    if not injections:
+        return ["injections: none"]
+    name = max(len(one["injector"]) for one in injections)
+    signal = max(len(one["signal"] or "whole frame") for one in injections)
+    lines = []
+    for one in injections:
+        end = "  no end" if one["end_s"] is None else f"{one['end_s']:8.3f}"
+        lines.append(
+            f"  {one['injector']:<{name}}  {one['signal'] or 'whole frame':<{signal}}  "
+            f"{one['start_s']:8.3f} ..{end} s  {one['frames']:5d} frames changed  {one['cause']}"
+        )
+    head = f"injections: {counts['activated']} activated, {counts['manifested']} of {counts['injected']} frames changed"
+    return [head, *lines]
+
+
+def _joint_lines(document: Summary) -> list[str]:
+    width = max(len(joint) for joint in (*document["joints"], "against golden"))
+    lines = [
+        f"{'against golden':<{width}}  RMSE:  rad    rad/s      N m  |  extremes: deg            rpm      N m",
+    ]
+    for joint, one in document["joints"].items():
+        lines.append(
+            f"  {joint:<{width - 2}}  {one['rmse_position_rad']:10.4f} {one['rmse_velocity_rad_s']:8.3f} "
+            f"{one['rmse_torque_nm']:8.2f}  |  {one['min_angle_deg']:7.1f} .. {one['max_angle_deg']:6.1f}  "
+            f"{one['max_speed_rpm']:8.1f} {one['max_torque_nm']:8.1f}"
+        )
+    return lines
+
+
+def _violation_lines(what: str, entries: list[ViolationEntry]) -> list[str]:
+    if not entries:
+        return []
+    joint = max(len(one["joint"]) for one in entries)
+    return [
+        f"{what + ':':<8} {one['joint']:<{joint}}  {one['kind'].replace('_', ' '):<9}  from {one['time_s']:6.3f} s, "
+        f"worst {one['value']:.1f} {UNITS[one['kind']]}, limit {one['limit']:g} {UNITS[one['kind']]}"
+        for one in entries
+    ]
+
+
+def _expectation_lines(document: Summary) -> list[str]:
+    entries = document["expectations"]
+    if not entries:
+        return []
+    unmet = [f"  not met: {one['text']} (found {one['found']:.4g})" for one in entries if not one["met"]]
+    return [f"expected: {len(entries) - len(unmet)} of {len(entries)} met", *_few(unmet, 2, "expectations not met")]
+
+
+def _few(lines: list[str], most: int, what: str) -> list[str]:
+    """At most `most` lines; the last one says how many are left out, when there are more."""
+    if len(lines) <= most:
+        return lines
+    shown = most - 1
+    return [*lines[:shown], f"  and {len(lines) - shown} more {what}, see summary.json"]

@@ -1,0 +1,290 @@
+"""Injectors by themselves: phases, windows, counts, records, trigger order and random streams."""
+
+import binascii
+import copy
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from canopen_exo.bus.frame import Frame
+from canopen_exo.bus.node import MS, NEVER
+from canopen_exo.signal import Signal
+from fi_gateway.effects import ConstantTime, Effect, Infinite, Once
+from fi_gateway.errors import FaultError
+from fi_gateway.events import At, Event, FailureProbability, Never
+from fi_gateway.faults import Bias, Drop, Fault, StuckAt, StuckAtValue
+from fi_gateway.injector import Injector, Phase, Target, Trigger, graph_order, stream
+
+WORD = Signal("statusword", "left_hip", "left_hip_TPDO2", 0x281, 0, 16, False, 1.0, "", 0x6041, 0)
+HERE = Target(True, False, (0x281,))
+
+
+def injector(
+    name: str = "x",
+    fault: Fault | None = None,
+    event: Event | None = None,
+    effect: Effect | None = None,
+    trigger: Trigger | None = None,
+    enabled: bool = True,
+) -> Injector:
+    return Injector(
+        name,
+        HERE,
+        fault if fault is not None else StuckAtValue(WORD, 0),
+        event if event is not None else At((10,)),
+        effect if effect is not None else ConstantTime(100),
+        trigger,
+        stream(1, 0, name),
+        enabled,
+    )
+
+
+def word(value: int) -> Frame:
+    return Frame(0x281, value.to_bytes(2, "little"))
+
+
+def phase(one: Injector) -> Phase:
+    return one.phase
+
+
+def test_injector_is_inert_until_its_time_base_is_known() -> None:
+    """faults.md: inert before time 0; then times count from it."""
+    one = injector()
+    assert (phase(one), one.next_ns) == (Phase.INERT, NEVER)
+    one.start(1000)
+    assert (phase(one), one.next_ns) == (Phase.ARMED, 1010)
+    one.start(5000)
+    assert one.next_ns == 1010
+
+
+def test_disabled_injector_never_arms() -> None:
+    """faults.md: each can be switched off."""
+    one = injector(enabled=False)
+    one.start(1000)
+    assert (phase(one), one.next_ns) == (Phase.INERT, NEVER)
+
+
+def test_constant_time_rearms_on_the_next_event() -> None:
+    """faults.md: then the injector re-arms (constant)."""
+    one = injector(event=At((10, 50, 110, 300)))
+    one.start(1000)
+    record = one.open(1010, "event")
+    assert record is not None
+    assert (phase(one), one.next_ns, record.end_ns) == (Phase.ACTIVE, 1110, 1110)
+    one.close(1110)
+    assert (phase(one), one.next_ns) == (Phase.ARMED, 1110)
+
+
+@pytest.mark.parametrize("effect", [Once(), Infinite()])
+def test_once_and_infinite_are_spent(effect: Effect) -> None:
+    """faults.md: or is spent (once, infinite)."""
+    one = injector(effect=effect, event=At((10, 20)))
+    one.start(0)
+    one.open(10, "event")
+    assert one.next_ns == NEVER
+    one.close(15)
+    assert (phase(one), one.next_ns) == (Phase.SPENT, NEVER)
+
+
+def test_once_acts_on_one_frame() -> None:
+    """faults.md: once = one frame; its window ends right after it."""
+    one = injector(effect=Once())
+    one.start(0)
+    record = one.open(10, "event")
+    assert record is not None
+    assert one.act(30, word(5)) == word(0)
+    assert (phase(one), record.end_ns, record.frames_changed) == (Phase.SPENT, 31, 1)
+
+
+def test_once_is_not_used_up_by_a_frame_it_cannot_act_on() -> None:
+    """A frame too short passes unchanged; the next one is the one."""
+    one = injector(effect=Once())
+    one.start(0)
+    one.open(10, "event")
+    short = Frame(0x281, b"\x01")
+    assert one.act(20, short) is short
+    assert one.act(30, word(5)) == word(0)
+    assert (one.too_short, one.injected) == (1, 1)
+
+
+def test_the_three_counts_differ() -> None:
+    """faults.md: injected, activated and manifested are three counts."""
+    one = injector()
+    one.start(0)
+    record = one.open(10, "event")
+    assert record is not None
+    for n, frame in enumerate([word(0), word(7), Frame(0x281, b""), word(0), word(8)]):
+        one.act(20 + n, frame)
+    assert (one.activated, one.injected, one.manifested, one.too_short) == (1, 4, 2, 1)
+    assert (record.frames_seen, record.frames_unfit, record.frames_changed) == (5, 1, 2)
+    assert (record.first_before, record.first_after) == (word(7), word(0))
+
+
+def test_a_lost_frame_has_no_after() -> None:
+    """Recorded: first changed frame before and after."""
+    one = injector(fault=Drop())
+    one.start(0)
+    record = one.open(10, "event")
+    assert record is not None
+    assert one.act(20, word(7)) is None
+    assert (record.first_before, record.first_after, record.frames_changed, record.signal) == (word(7), None, 1, "")
+
+
+def test_record_names_signal_cause_and_times() -> None:
+    """Recorded per activation: sampled times, cause, signal."""
+    one = injector("freeze")
+    one.start(1000)
+    record = one.open(1010, "trigger:other")
+    assert record is not None
+    assert (record.injector, record.index, record.signal) == ("freeze", 0, "left_hip.statusword")
+    assert (record.cause, record.due_ns, record.start_ns, record.duration_ns) == ("trigger:other", 1010, 1010, 100)
+    one.close(1110)
+    again = one.open(1200, "event")
+    assert again is not None
+    assert again.index == 1
+
+
+def test_waiting_keeps_its_cause_and_due_time() -> None:
+    """stuck_at waits for a value; the window opens later, the record says when it was due."""
+    one = injector(fault=StuckAt(WORD))
+    one.start(0)
+    assert one.open(10, "event") is None
+    assert (phase(one), one.next_ns, one.activated) == (Phase.WAITING, NEVER, 0)
+    one.held[0x281] = word(9)
+    record = one.open(40, "frame")
+    assert record is not None
+    assert (record.cause, record.due_ns, record.start_ns, record.end_ns) == ("event", 10, 40, 140)
+
+
+def test_a_frame_stamped_before_the_window_passes_when_it_is_read_late() -> None:
+    """faults.md: the window is on the frame's arrival time."""
+    one = injector()
+    one.start(0)
+    one.open(10, "event")
+    early = word(7)
+    assert one.act(9, early) is early
+    assert one.injected == 0
+
+
+def test_saturated_values_are_in_the_record() -> None:
+    """faults.md: values that no longer fit saturate and say so once (per activation)."""
+    one = injector(fault=Bias(WORD, 10))
+    one.start(0)
+    record = one.open(10, "event")
+    assert record is not None
+    one.act(20, word(65530))
+    one.act(21, word(1))
+    one.act(22, word(65535))
+    one.close(110)
+    assert record.saturated == 2
+
+
+@pytest.mark.parametrize(("start", "length", "least"), [(0, 1, 1), (0, 8, 1), (0, 9, 2), (7, 1, 1), (7, 2, 2), (48, 16, 8)])
+def test_a_frame_is_remembered_from_the_byte_with_the_last_bit(start: int, length: int, least: int) -> None:
+    """A shorter frame holds no correct value of the signal."""
+    signal = Signal("s", "n", "m", 0x281, start, length, False, 1.0, "", 0x2000, 0)
+    assert injector(fault=StuckAt(signal)).least_bytes == least
+
+
+@pytest.mark.parametrize("cob_ids", [(0x282,), (0x281, 0x282)])
+def test_a_signal_is_refused_where_it_does_not_lie(cob_ids: tuple[int, ...]) -> None:
+    """The message names the COB-ID that is right."""
+    with pytest.raises(FaultError, match=r"injector x.*left_hip\.statusword.*0x281"):
+        Injector(
+            "x",
+            Target(True, False, cob_ids),
+            StuckAtValue(WORD, 0),
+            Never(),
+            Once(),
+            None,
+            stream(1, 0, "x"),
+        )
+
+
+@pytest.mark.parametrize(
+    ("up", "down", "cob_ids"), [(False, False, (1,)), (True, False, ()), (True, True, (-1,)), (True, True, (0x800,))]
+)
+def test_target_refuses_nothing_and_what_is_no_cob_id(up: bool, down: bool, cob_ids: tuple[int, ...]) -> None:
+    """Bad parameters are refused where they are made."""
+    with pytest.raises(FaultError, match="allowed"):
+        Target(up, down, cob_ids)
+
+
+@pytest.mark.parametrize(("names", "on"), [((), "activated"), (("a",), "manifested"), (("a",), "")])
+def test_trigger_refuses_what_is_not_there_yet(names: tuple[str, ...], on: str) -> None:
+    """The message lists what is allowed."""
+    with pytest.raises(FaultError, match="allowed"):
+        Trigger(names, on)
+
+
+def names(injectors: list[Injector]) -> list[str]:
+    return [one.name for one in graph_order(injectors)]
+
+
+def test_sources_come_before_what_they_trigger_otherwise_as_written() -> None:
+    """faults.md: triggers settle in graph order; chains may branch and join."""
+    join = injector("join", trigger=Trigger(("left", "right")))
+    left = injector("left", trigger=Trigger(("root",)))
+    right = injector("right", trigger=Trigger(("root",)))
+    order = names([injector("z"), join, left, right, injector("root"), injector("a")])
+    assert order == ["z", "root", "left", "right", "join", "a"]
+
+
+def test_a_cycle_is_refused_with_the_cycle_printed() -> None:
+    """faults.md: a cycle is refused with the cycle printed, in the direction in which the triggers run."""
+    ring = [
+        injector("in", trigger=Trigger(("c",))),
+        injector("a", trigger=Trigger(("c",))),
+        injector("b", trigger=Trigger(("a",))),
+        injector("c", trigger=Trigger(("b",))),
+    ]
+    with pytest.raises(FaultError, match="c -> a -> b -> c"):
+        graph_order(ring)
+
+
+def test_an_injector_that_triggers_itself_is_refused() -> None:
+    """The shortest cycle."""
+    with pytest.raises(FaultError, match="a -> a"):
+        graph_order([injector("a", trigger=Trigger(("a",)))])
+
+
+def test_unknown_and_double_names_are_refused() -> None:
+    """The message names what is there."""
+    with pytest.raises(FaultError, match="'ghost', allowed are a, b"):
+        graph_order([injector("a", trigger=Trigger(("ghost",))), injector("b")])
+    with pytest.raises(FaultError, match="given twice"):
+        graph_order([injector("a"), injector("a")])
+
+
+def test_stream_is_the_documented_one() -> None:
+    """faults.md: SeedSequence(seed, spawn_key = (run, crc32(name))); crc32("freeze_position") by binascii."""
+    expected = np.random.Generator(
+        np.random.PCG64(np.random.SeedSequence(2020, spawn_key=(3, binascii.crc32(b"freeze_position"))))
+    )
+    assert stream(2020, 3, "freeze_position").random(5).tolist() == expected.random(5).tolist()
+
+
+def test_streams_differ_by_seed_run_and_name_and_are_uncorrelated() -> None:
+    """One stream per injector; Pearson correlation not significant at 1 % with fixed seeds."""
+    first = stream(1, 0, "a").random(2000)
+    for other in (stream(2, 0, "a"), stream(1, 1, "a"), stream(1, 0, "b")):
+        second = other.random(2000)
+        assert first.tolist() != second.tolist()
+        assert stats.pearsonr(first, second).pvalue > 0.01
+
+
+def test_a_copy_keeps_event_fault_and_injector_on_one_stream() -> None:
+    """Snapshots: a copy draws what the original draws."""
+    generator = stream(5, 0, "x")
+    event = FailureProbability(0.01, MS, generator)
+    one = Injector("x", HERE, Drop(0.5), event, ConstantTime(5 * MS), None, generator)
+    one.start(0)
+    one.open(one.next_ns, "event")
+    one.act(one.next_ns - 1, word(1))
+    twin = copy.deepcopy(one)
+    for each in (one, twin):
+        for n in range(30):
+            each.act(each.next_ns - 1, word(n))
+        each.close(each.next_ns)
+    assert (one.next_ns, one.manifested) == (twin.next_ns, twin.manifested)
