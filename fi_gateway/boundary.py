@@ -8,7 +8,7 @@ import types
 from collections.abc import Callable
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
-from typing import Annotated, ClassVar, Final, TypeAlias, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, ClassVar, Final, TypeAlias, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 from pydantic import (
     BeforeValidator,
@@ -102,8 +102,12 @@ Text: TypeAlias = Annotated[str, Strict()]
 
 
 @cache
-def _adapter(model: type[SpecModel]) -> TypeAdapter[SpecModel]:
-    return TypeAdapter(model)
+def _made_once(model: object) -> TypeAdapter[SpecModel]:
+    return TypeAdapter(cast("type[SpecModel]", model))
+
+
+def _adapter(model: object) -> TypeAdapter[SpecModel]:
+    return _made_once(model)  # by way of object: mypy takes classes for unhashable
 
 
 def validate(model: type[T], data: Data, keys: Keys, document: Document | None) -> T | None:

@@ -6,7 +6,7 @@ values do not fit the target.
 
 import re
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Final, Literal, TypeAlias
+from typing import Annotated, Final, Literal, TypeAlias
 
 from pydantic import Field, PlainValidator, WithJsonSchema
 
@@ -184,8 +184,6 @@ class BitFlipSpec(FaultSpec):
 
     Positions count from the lowest bit of the signal, or from bit 0 of byte 0 of the payload.
     """
-
-    later: ClassVar[tuple[str, ...]] = ("probability",)
 
     type: Literal["bit_flip"]
     count: Count | None = None

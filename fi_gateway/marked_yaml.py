@@ -27,6 +27,7 @@ MAX_DEPTH: Final = 32
 
 _INTEGER: Final = re.compile(r"[-+]?[0-9]{1,30}|0x[0-9a-fA-F]{1,24}", re.ASCII)
 _FLOAT: Final = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?", re.ASCII)
+_BREAKS: Final = re.compile("[\x85\u2028\u2029\ufeff]")
 _NOT_FINITE: Final = re.compile(r"[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)")
 _WORDS: Final[dict[str, bool | None]] = {
     **dict.fromkeys(("true", "True", "TRUE"), True),
@@ -48,7 +49,10 @@ class FileErrors(FaultError):  # noqa: N818 (it is all the errors of a file)
 
 @dataclass(frozen=True, slots=True)
 class Mark:
-    """Where a value was written. line, column: from 1; override: the `--set key=value` it came from, or ""."""
+    """Where a value was written.
+
+    line, column: from 1; override: the `--set key=value` it came from, or "", and then line is that one's number.
+    """
 
     line: int
     column: int
@@ -69,7 +73,7 @@ class Document:
     """Plain data, the marks of its values and of the keys before them, and what is wrong so far.
 
     source: the file as messages name it. broken: places without usable data; what is said about them or below
-    them later would only be a consequence, and is not reported.
+    them later would only be a consequence, and is not reported. overrides: how many were applied.
     """
 
     source: str
@@ -78,6 +82,7 @@ class Document:
     keys: dict[Keys, Mark] = field(default_factory=dict)
     problems: list[Problem] = field(default_factory=list)
     broken: set[Keys] = field(default_factory=set)
+    overrides: int = 0
 
     def mark(self, keys: Keys, at_key: bool = False) -> Mark:
         """Mark of the value (or of its key); of the nearest thing around it where there is none."""
@@ -173,9 +178,17 @@ def write(data: dict[str, Data]) -> str:
 
 
 class _Dumper(yaml.SafeDumper):
-    """Puts quotes around texts that only our notation of numbers takes for a number, such as 1e3."""
+    """Puts quotes around texts that only our notation of numbers takes for a number, such as 1e3.
+
+    Texts with the line breaks of Unicode are escaped, which YAML would otherwise fold into spaces.
+    """
 
 
+def _text(dumper: yaml.SafeDumper, text: str) -> yaml.ScalarNode:
+    return dumper.represent_scalar("tag:yaml.org,2002:str", text, style='"' if _BREAKS.search(text) else None)
+
+
+_Dumper.add_representer(str, _text)
 _Dumper.add_implicit_resolver("tag:yaml.org,2002:int", re.compile(f"({_INTEGER.pattern})\\Z"), list("-+0123456789"))
 _Dumper.add_implicit_resolver("tag:yaml.org,2002:float", re.compile(f"({_FLOAT.pattern})\\Z"), list("-+.0123456789"))
 
@@ -186,7 +199,8 @@ def apply_override(document: Document, override: str) -> None:
     The last part of the path may be new; the parts before it must exist. Problems go to the document.
     """
     key, equals, text = override.partition("=")
-    origin = Mark(0, 0, f"--set {override}")
+    document.overrides += 1
+    origin = Mark(document.overrides, 0, f"--set {override}")
     parts = key.strip().split(".")
     if not equals or not all(parts):
         document.problems.append(Problem((), origin, "expected key=value, such as motion.duration=7s"))

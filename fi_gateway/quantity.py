@@ -185,8 +185,8 @@ def _match(text: str) -> re.Match[str] | None:
 
 def _number(text: str, given: str) -> Fraction:
     number = Decimal(text)
-    if number and abs(number.adjusted()) > _MAX_EXPONENT:
-        raise QuantityError(f"{given!r} is too large or too small; allowed 1e-{_MAX_EXPONENT}..1e{_MAX_EXPONENT}")
+    if number and number.adjusted() > _MAX_EXPONENT:
+        raise QuantityError(f"{given!r} is too large; allowed up to 1e{_MAX_EXPONENT}")
     return Fraction(number)
 
 

@@ -67,7 +67,7 @@ SignalName: TypeAlias = Annotated[str, PlainValidator(_signal_name), WithJsonSch
 class TargetSpec(SpecModel):
     """`target:` of an injector. bus: the direction of travel; then node with signal or pdo, pdo alone, or cob_id."""
 
-    later: ClassVar[tuple[str, ...]] = ("kind", "mask")
+    later: ClassVar[tuple[str, ...]] = ("kind",)
 
     bus: Literal["to_controller", "to_drives", "both"]
     node: Text | None = None

@@ -5,6 +5,7 @@ Everything heavy is imported by the verb that needs it.
 """
 
 import argparse
+import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -27,9 +28,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         _say("interrupted; nothing was written")
         return INTERRUPTED
-    except BrokenPipeError:
-        sys.stderr.close()  # the reader of our output has left; so do we
-        return PASS
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -107,12 +105,12 @@ def _run(options: argparse.Namespace) -> int:
     from hlc.limits import limits_of
     from joint_emulators.errors import JointEmulatorError
     from testbench.report import Plotted, plot_files
-    from testbench.run import NotStarted, run_scenario
+    from testbench.run import run_scenario
 
     try:
         with _progress(scenario.name) as progress:
             result = run_scenario(scenario, progress)
-    except (NotStarted, JointEmulatorError) as error:
+    except (BenchError, JointEmulatorError) as error:
         _say(f"{scenario.name}: run invalid: {error}")
         return INVALID
     names = tuple(joint.name for joint in scenario.plan.joints)
@@ -125,7 +123,7 @@ def _run(options: argparse.Namespace) -> int:
     except BenchError as error:
         _say(str(error))
         return USAGE
-    print(summary_json(result.document) if options.json else summary_text(result.document), end="")
+    _print(summary_json(result.document) if options.json else summary_text(result.document))
     _say(f"result folder: {written}")
     if not result.document["valid"]:
         return INVALID
@@ -142,7 +140,7 @@ def _check(options: argparse.Namespace) -> int:
     except FileErrors as error:
         _say(str(error))
         return USAGE
-    print("\n".join(describe(scenario)))
+    _print("\n".join(describe(scenario)) + "\n")
     for warning in scenario.warnings:
         _say(f"warning: {warning}")
     return PASS
@@ -155,12 +153,12 @@ def _export(options: argparse.Namespace) -> int:
 
         from testbench.scenario import scenario_schema
 
-        print(json.dumps(scenario_schema(), indent=2))
+        _print(json.dumps(scenario_schema(), indent=2) + "\n")
         return PASS
     from importlib.resources import files
 
     name = {"eds": "exo_joint.eds", "dbc": "exo.dbc"}[options.what]
-    sys.stdout.write((files("dbc") / name).read_text(encoding="utf-8"))
+    _print((files("dbc") / name).read_text(encoding="utf-8"))
     return PASS
 
 
@@ -173,10 +171,20 @@ def _progress(name: str) -> Iterator[Callable[[float], None]]:
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:3.0f} %"), TimeRemainingColumn())
+    percent = TextColumn("{task.percentage:3.0f} %")
+    columns = (TextColumn("{task.description}"), BarColumn(), percent, TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(name, total=1.0)
         yield lambda share: bar.update(task, completed=share)
+
+
+def _print(text: str) -> None:
+    """The result, to stdout. A reader that has left (`| head`) changes nothing about the exit code."""
+    try:
+        sys.stdout.write(text)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _say(text: str) -> None:

@@ -81,8 +81,9 @@ class RunRecord:
     """One run. rows: trace of all buses in loop order.
 
     time0_ns: time 0 on the loop's clock, as the gateway took it from the bus; duration_ns: of the motion, from time 0;
-    buses: by bus index; activations: in the order they began, closed; notes: in time order; invalid_reasons: why the
-    run proves nothing, empty when it is valid.
+    buses: by bus index; activations: in the order they began, closed; notes: in time order; completed: False when the
+    controller ended the motion early; held_cycles: per joint, cycles in which its last sample was used again because
+    no new one had come; invalid_reasons: why the run proves nothing, empty when it is valid.
     """
 
     rows: list[Transmission]
@@ -93,6 +94,8 @@ class RunRecord:
     activations: list[Activation]
     buses: tuple[BusStats, ...]
     notes: list[RigEvent] = field(default_factory=list)
+    completed: bool = True
+    held_cycles: list[int] = field(default_factory=list)
     invalid_reasons: list[str] = field(default_factory=list)
 
     @property

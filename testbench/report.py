@@ -31,6 +31,7 @@ _FAULTED: Final = "#9e1b32"
 _REFERENCE: Final = "#222222"
 _COMMAND: Final = "#8a8a8a"
 _WINDOW: Final = "#f3c55b"
+_WINDOW_EDGE: Final = "#d99a1c"  # so that a window of one frame is seen too
 _LIMIT: Final = "#555555"
 _RPM: Final = 30 / np.pi
 
@@ -178,7 +179,7 @@ def _pair(axes: "Axes", golden: Truth, faulted: Truth, before: Array, after: Arr
 
 def _shade(axes: "Axes", spans: list[tuple[float, float]]) -> None:
     for start_s, end_s in spans:
-        axes.axvspan(start_s, end_s, color=_WINDOW, alpha=0.35, lw=0.8, zorder=0)
+        axes.axvspan(start_s, end_s, facecolor=(_WINDOW, 0.35), edgecolor=_WINDOW_EDGE, lw=0.9, zorder=0)
 
 
 def _heading(figure: "Figure", shown: Plotted, subject: str) -> None:
@@ -207,5 +208,5 @@ def _legend(figure: "Figure", *, with_reference: bool, with_windows: bool) -> No
         entries.append(Line2D([], [], color=_COMMAND, lw=0.9, label="torque command before clamp (may leave the plot)"))
     entries.append(Line2D([], [], color=_LIMIT, lw=1.0, ls="-.", label="limit"))
     if with_windows:
-        entries.append(Patch(facecolor=_WINDOW, alpha=0.35, label="fault active"))
+        entries.append(Patch(facecolor=(_WINDOW, 0.35), edgecolor=_WINDOW_EDGE, lw=0.9, label="fault active"))
     figure.legend(handles=entries, loc="outside lower center", ncols=len(entries), frameon=False, fontsize=9)

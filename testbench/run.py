@@ -38,7 +38,7 @@ Progress = Callable[[float], None]
 """Told the share 0..1 of the work that is done."""
 
 
-class NotStarted(BenchError):
+class NotStartedError(BenchError):
     """The motion never began, so there is nothing to judge; the message says why."""
 
 
@@ -54,7 +54,7 @@ class Result:
 
 
 def run_scenario(scenario: Scenario, progress: Progress = lambda share: None) -> Result:
-    """Golden run, faulted run, verdict. Raises NotStarted when the motion of either never begins."""
+    """Golden run, faulted run, verdict. Raises NotStartedError when the motion of either never begins."""
     started = time.perf_counter()
     params = rig_params(scenario)
     golden, golden_ns = run_rig(params, [], lambda share: progress(0.5 * share))
@@ -90,7 +90,7 @@ def rig_params(scenario: Scenario) -> RigParams:
 def run_rig(
     params: RigParams, injectors: list[Injector], progress: Progress = lambda share: None
 ) -> tuple[RunRecord, int]:
-    """One run from power-up to disabled drives; the record and the time simulated [ns]. Raises NotStarted."""
+    """One run from power-up to disabled drives; the record and the time simulated [ns]. Raises NotStartedError."""
     rig = build_rig(params, injectors)
     collecting = gc.isenabled()
     gc.disable()  # nothing in a run makes cycles of references; looking for them costs a fifth of the time
@@ -121,12 +121,12 @@ def drive_through(rig: Rig, progress: Progress) -> None:
 
 
 def record_of(rig: Rig) -> RunRecord:
-    """What a finished run leaves behind; raises NotStarted when the motion never began."""
+    """What a finished run leaves behind; raises NotStartedError when the motion never began."""
     controller, params = rig.controller, rig.params
     zero = controller.time_zero
     if zero == NEVER or rig.gateway.time_zero == NEVER or not controller.samples:
         reasons = "; ".join(f"{event.joint + ': ' if event.joint else ''}{event.text}" for event in controller.events)
-        raise NotStarted(f"the motion never began: {reasons or 'the bus carried no status of the controller'}")
+        raise NotStartedError(f"the motion never began: {reasons or 'the bus carried no status of the controller'}")
     rows = [row for row in rig.rack.truth if zero <= row.time_ns <= zero + params.duration_ns]
     truth = Truth(
         np.array([row.time_ns - zero for row in rows]) / 1e9,
@@ -154,6 +154,8 @@ def record_of(rig: Rig) -> RunRecord:
             RigEvent((event.time_ns - zero) / 1e9, event.joint or "HLC", event.kind, event.text)
             for event in controller.events
         ],
+        completed=controller.completed,
+        held_cycles=list(controller.late),
         invalid_reasons=_invalid_reasons(rig),
     )
 

@@ -142,7 +142,7 @@ Pins: TypeAlias = Annotated[
 class Rig(SpecModel):
     """What is simulated. stops: mechanical pins at the range of travel; cycle_ns: control cycle (key `rate`, in Hz)."""
 
-    later: ClassVar[tuple[str, ...]] = ("file", "nodes", "mapping", "bitrate")
+    later: ClassVar[tuple[str, ...]] = ("file",)
 
     plant: Annotated[Literal["suspended"], Later(("walking",))]
     stops: Pins
@@ -170,8 +170,6 @@ class Scenario(SpecModel):
 
     tolerance_rad: how far beyond the range of travel is not yet a failure.
     """
-
-    later: ClassVar[tuple[str, ...]] = ("sweep", "grid")
 
     name: Annotated[str, BeforeValidator(_name)]
     rig: Rig

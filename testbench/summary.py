@@ -64,7 +64,10 @@ class CountEntry(TypedDict):
 
 
 class JointEntry(TypedDict):
-    """Faulted against golden run, and extremes of the faulted run, over the motion."""
+    """Faulted against golden run, and extremes of the faulted run, over the motion.
+
+    held_cycles: control cycles of the faulted run in which no new sample came in time and the last one was used again.
+    """
 
     rmse_position_rad: float
     rmse_velocity_rad_s: float
@@ -73,6 +76,7 @@ class JointEntry(TypedDict):
     max_angle_deg: float
     max_speed_rpm: float
     max_torque_nm: float
+    held_cycles: int
 
 
 class ViolationEntry(TypedDict):
@@ -119,6 +123,7 @@ class Summary(TypedDict):
     invalid_reasons: list[str]
     verdict: str
     outcome: str
+    completed: bool
     sim_time_s: float
     wall_time_s: float
     x_realtime: float
@@ -161,6 +166,7 @@ def summary_document(
         + [f"faulted run: {reason}" for reason in faulted.invalid_reasons],
         "verdict": "pass" if judgement.passed else "fail",
         "outcome": judgement.outcome,
+        "completed": faulted.completed,
         "sim_time_s": sim_time_s,
         "wall_time_s": wall_time_s,
         "x_realtime": sim_time_s / wall_time_s if wall_time_s > 0 else 0.0,
@@ -174,7 +180,10 @@ def summary_document(
         "trace_hash": {"golden": trace_hash(golden.rows), "faulted": trace_hash(faulted.rows)},
         "counts": _counts(faulted.activations),
         "injections": [_injection(activation, faulted.time0_ns) for activation in faulted.activations],
-        "joints": {joint: _joint(one) for joint, one in judgement.comparison.items()},
+        "joints": {
+            joint: _joint(one, held)
+            for (joint, one), held in zip(judgement.comparison.items(), _held(faulted, judgement), strict=True)
+        },
         "golden": {
             "tracking_rmse_rad": dict(judgement.tracking_rmse_rad),
             "errors": _violations(judgement.golden_errors),
@@ -248,7 +257,11 @@ def _frame(frame: Frame | None) -> str | None:
     return None if frame is None else candump_frame(frame)
 
 
-def _joint(one: JointComparison) -> JointEntry:
+def _held(faulted: RunRecord, judgement: Judgement) -> list[int]:
+    return faulted.held_cycles or [0] * len(judgement.comparison)
+
+
+def _joint(one: JointComparison, held_cycles: int) -> JointEntry:
     return {
         "rmse_position_rad": one.rmse_position_rad,
         "rmse_velocity_rad_s": one.rmse_velocity_rad_s,
@@ -257,6 +270,7 @@ def _joint(one: JointComparison) -> JointEntry:
         "max_angle_deg": one.max_angle_deg,
         "max_speed_rpm": one.max_speed_rpm,
         "max_torque_nm": one.max_torque_nm,
+        "held_cycles": held_cycles,
     }
 
 
@@ -277,6 +291,7 @@ def summary_text(document: Summary) -> str:
         f"      {document['sim_time_s']:.1f} s simulated in {document['wall_time_s']:.2f} s "
         f"({document['x_realtime']:.1f} x real time); {load}",
         *_few([f"      {reason}" for reason in document["invalid_reasons"]], 2, "reasons"),
+        *_few([_event_line(event) for event in document["events"]], 3, "events"),
     ]
     tail = [
         *_joint_lines(document),
@@ -294,10 +309,15 @@ def _outcome_text(document: Summary) -> str:
     return {
         "invalid": "the run is invalid and proves nothing",
         "failure": "failure, a joint went beyond its range of travel",
+        "detected_safe": "detected, drives or controller ended the motion before a failure",
         "error": "error, a torque or speed limit was exceeded",
         "masked": "masked, faults were injected and every limit was kept",
         "not_activated": "no fault was activated",
     }[document["outcome"]]
+
+
+def _event_line(event: EventEntry) -> str:
+    return f"      at {event['time_s']:.3f} s  {event['node']}: {event['text']}"
 
 
 def _injection_lines(document: Summary) -> list[str]:

@@ -72,7 +72,8 @@ class ExpectationResult:
 class Judgement:
     """What is said about a pair of runs.
 
-    outcome: invalid, failure, error, not_activated or masked, the first of these that holds; passed: the verdict.
+    outcome: invalid, failure, detected_safe (drive or controller ended the motion before a failure), error,
+    not_activated or masked, the first of these that holds; passed: the verdict.
     golden_errors, golden_failures: of the golden run itself; a rig that breaks limits without a fault shows here.
     """
 
@@ -144,6 +145,8 @@ def _outcome(
         return "invalid"
     if failures:
         return "failure"
+    if not faulted.completed:
+        return "detected_safe"
     if errors:
         return "error"
     return "masked" if faulted.activations else "not_activated"
@@ -225,6 +228,7 @@ def quantities(
         "errors": float(errors),
         "failures": float(failures),
         "injections": float(len(faulted.activations)),
+        "completed": float(faulted.completed),
         "golden.tracking_rmse": max(tracking_rmse_rad.values()),
     }
     for joint, value in tracking_rmse_rad.items():

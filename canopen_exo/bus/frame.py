@@ -33,19 +33,18 @@ class Frame:
         self.can_id: Final[int] = can_id
         self.data: Final[bytes] = data
         self.flags: Final[int] = flags
-        if flags == 0 and dlc < 0:  # the frames of nearly every cycle
-            if can_id < 0 or can_id > 0x7FF or len(data) > 8:
-                check_frame(can_id, data, flags, dlc)
-            self.dlc: Final[int] = len(data)
-            self.arbitration: Final[int] = can_id << 21
-        else:
+        wire_dlc = len(data)
+        arbitration = can_id << 21
+        if flags or dlc >= 0 or wire_dlc > 8 or can_id < 0 or can_id > 0x7FF:  # not the frames of nearly every cycle
             check_frame(can_id, data, flags, dlc)
-            self.dlc = dlc if dlc >= 0 else _wire_dlc(len(data))
+            wire_dlc = dlc if dlc >= 0 else _wire_dlc(wire_dlc)
             remote = 1 if flags & FLAG_REMOTE else 0
             if flags & FLAG_EXTENDED:  # ID28-18, SRR 1, IDE 1, ID17-0, RTR
-                self.arbitration = (can_id >> 18) << 21 | 3 << 19 | (can_id & 0x3FFFF) << 1 | remote
+                arbitration = (can_id >> 18) << 21 | 3 << 19 | (can_id & 0x3FFFF) << 1 | remote
             else:  # ID, RTR, IDE 0
-                self.arbitration = can_id << 21 | remote << 20
+                arbitration = can_id << 21 | remote << 20
+        self.dlc: Final[int] = wire_dlc
+        self.arbitration: Final[int] = arbitration
         self.bits: int = 0
 
     def measure(self) -> int:
@@ -57,7 +56,7 @@ class Frame:
 
     def with_data(self, data: bytes) -> "Frame":
         """The same frame with another payload of the same length."""
-        return Frame(self.can_id, data, self.flags, self.dlc if self.flags else -1)
+        return Frame(self.can_id, data, self.flags, self.dlc)
 
     def __eq__(self, other: object) -> bool:
         return (

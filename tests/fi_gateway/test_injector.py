@@ -180,7 +180,9 @@ def test_saturated_values_are_in_the_record() -> None:
     assert record.saturated == 2
 
 
-@pytest.mark.parametrize(("start", "length", "least"), [(0, 1, 1), (0, 8, 1), (0, 9, 2), (7, 1, 1), (7, 2, 2), (48, 16, 8)])
+@pytest.mark.parametrize(
+    ("start", "length", "least"), [(0, 1, 1), (0, 8, 1), (0, 9, 2), (7, 1, 1), (7, 2, 2), (48, 16, 8)]
+)
 def test_a_frame_is_remembered_from_the_byte_with_the_last_bit(start: int, length: int, least: int) -> None:
     """A shorter frame holds no correct value of the signal."""
     signal = Signal("s", "n", "m", 0x281, start, length, False, 1.0, "", 0x2000, 0)

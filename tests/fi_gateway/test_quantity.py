@@ -74,8 +74,8 @@ def test_a_bare_number_is_refused_with_the_units_allowed(given: object, dimensio
         ("1,5 s", "unknown unit"),
         ("1_000 s", "unknown unit"),
         ("\uff11 s", "is not a duration"),
-        ("1e31 s", "too large or too small"),
-        ("1e-31 s", "too large or too small"),
+        ("1e31 s", "too large; allowed up to 1e30"),
+        ("100e29 s", "too large; allowed up to 1e30"),
         ("1e9999 s", "unknown unit"),
         ("1" * 61 + " s", "is not a duration"),
         (None, "got nothing"),
@@ -140,7 +140,7 @@ def test_durations_are_written_as_people_write_them(ns: int, text: str) -> None:
     assert format_duration(ns) == text
 
 
-@given(st.floats(-1e25, 1e25).filter(lambda value: value == 0 or abs(value) > 1e-25), st.sampled_from(Dimension))
+@given(st.floats(-1e30, 1e30), st.sampled_from(Dimension))
 def test_every_si_value_survives_being_written(value: float, dimension: Dimension) -> None:
     """Round trip SI -> text -> SI, to the last bit."""
     assert parse_quantity(format_quantity(value, dimension), dimension) == value

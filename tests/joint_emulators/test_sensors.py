@@ -21,6 +21,7 @@ from joint_emulators.sensors import (
     VelocityEstimateState,
     encode,
     estimate_velocity,
+    to_int32,
     hall_state,
 )
 
@@ -83,7 +84,7 @@ def test_impossible_encoder_is_refused(counts: int, direction: int) -> None:
 
 def run_estimate(counts: list[int], params: VelocityEstimateParams = VELOCITY) -> list[int]:
     state = VelocityEstimateState()
-    return [estimate_velocity(params, state, value) for value in counts]
+    return [to_int32(estimate_velocity(params, state, value)) for value in counts]
 
 
 def test_first_sample_has_no_speed_wherever_the_joint_stands() -> None:

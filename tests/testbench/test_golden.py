@@ -122,6 +122,14 @@ def test_tracking_uses_the_sample_latched_at_the_sync() -> None:
     assert found["right_knee"] == 0.0
 
 
+def test_rounding_of_seconds_does_not_change_the_sample() -> None:
+    """The same nanosecond, reached by two ways of computing seconds, is the same instant."""
+    t_s = np.arange(11) / 1000
+    t_command = np.nextafter(t_s[2::2], -np.inf)
+    found = tracking_rmse(ONE, truth(t_s, np.arange(11.0)), commands(t_command, np.arange(2.0, 11, 2)), 0.01)
+    assert found["right_knee"] == 0.0
+
+
 def test_tracking_leaves_out_what_is_outside_the_motion_or_has_no_sample() -> None:
     """Fading in is not tracking; an instant before the first sample has nothing to be compared with."""
     t_s = np.arange(0, 11) / 1000

@@ -1,0 +1,445 @@
+"""The lock-step loop: one written total order, to the nanosecond."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from canopen_exo.bus.frame import Frame
+from canopen_exo.bus.loop import Loop
+from canopen_exo.bus.medium import Medium
+from canopen_exo.bus.node import NEVER, Node, Out
+from canopen_exo.bus.trace import trace_hash
+from canopen_exo.errors import CanopenExoError
+
+BIT = 1000
+"""ns at 1 Mbit/s."""
+
+Call = tuple[str, str, int, int, str]
+"""Node, "frame" or "wake", now, port (-1 for a wake-up), frame."""
+
+
+class Script(Node):
+    """Sends frames at given times, on given ports, and writes down every call."""
+
+    def __init__(self, name: str, log: list[Call], *sends: tuple[int, int, Frame]) -> None:
+        super().__init__()
+        self.name = name
+        self.log = log
+        self.sends = sorted(sends, key=lambda item: item[0])
+        self._next()
+
+    def _next(self) -> None:
+        self.wake_at = self.sends[0][0] if self.sends else NEVER
+
+    def receive(self, now: int, port: int, frame: Frame, out: Out) -> None:
+        self.log.append((self.name, "frame", now, port, repr(frame)))
+
+    def wake(self, now: int, out: Out) -> None:
+        self.log.append((self.name, "wake", now, -1, ""))
+        while self.sends and self.sends[0][0] <= now:
+            _, port, frame = self.sends.pop(0)
+            out.send(port, frame)
+        self._next()
+
+
+class Echo(Script):
+    """Answers every frame at once with one of another id."""
+
+    def receive(self, now: int, port: int, frame: Frame, out: Out) -> None:
+        super().receive(now, port, frame, out)
+        out.send(port, Frame(frame.can_id + 0x100, frame.data))
+
+
+def duration(can_id: int, size: int = 0) -> int:
+    return Frame(can_id, bytes(size)).measure() * BIT
+
+
+def media(count: int = 1) -> list[Medium]:
+    return [Medium(f"bus {index}", index, 1_000_000) for index in range(count)]
+
+
+def rows(loop: Loop) -> list[tuple[int, int, int, int]]:
+    return [(row.end_ns, row.bus, row.sender, row.frame.can_id) for row in loop.trace]
+
+
+# --- times -------------------------------------------------------------------------------------------------------
+
+
+def test_frame_is_received_when_it_ends() -> None:
+    """Design: `now` in receive is the end of the frame; it starts when it is sent on an idle bus."""
+    log: list[Call] = []
+    loop = Loop(media())
+    loop.connect(Script("a", log, (700, 0, Frame(0x123, b"\1\2"))), loop.media)
+    loop.connect(Script("b", log), loop.media)
+    loop.run_until(1_000_000)
+    end = 700 + Frame(0x123, b"\1\2").measure() * BIT
+    assert log == [("a", "wake", 700, -1, ""), ("b", "frame", end, 0, "123#0102")]
+    assert rows(loop) == [(end, 0, 0, 0x123)]
+
+
+def test_next_frame_starts_at_the_end_of_the_previous_one() -> None:
+    """Wire rules: next start = max(end of previous, arrival), here the end."""
+    loop = Loop(media())
+    loop.connect(Script("a", [], (0, 0, Frame(2, b"")), (1, 0, Frame(1, b"")), (2, 0, Frame(3, b""))), loop.media)
+    loop.run_until(1_000_000)
+    first = duration(2)
+    assert rows(loop) == [
+        (first, 0, 0, 2),
+        (first + duration(1), 0, 0, 1),
+        (first + duration(1) + duration(3), 0, 0, 3),
+    ]
+
+
+@pytest.mark.parametrize("late", [0, 1, 999])
+def test_frame_that_arrives_on_an_idle_bus_starts_at_once(late: int) -> None:
+    """Wire rules: next start = max(end of previous, arrival), here the arrival; no bit grid."""
+    loop = Loop(media())
+    arrival = duration(5) + late
+    loop.connect(Script("a", [], (0, 0, Frame(5, b"")), (arrival, 0, Frame(6, b""))), loop.media)
+    loop.run_until(1_000_000)
+    assert rows(loop) == [(duration(5), 0, 0, 5), (arrival + duration(6), 0, 0, 6)]
+
+
+def test_frames_of_one_instant_compete_whoever_spoke_first() -> None:
+    """Design: per instant deliver, wake, then arbitrate: the last node to be woken may win."""
+    loop = Loop(media())
+    for name, can_id in (("a", 9), ("b", 8), ("c", 7)):
+        loop.connect(Script(name, [], (50, 0, Frame(can_id, b""))), loop.media)
+    loop.run_until(1_000_000)
+    assert [row[3] for row in rows(loop)] == [7, 8, 9]
+
+
+def test_answer_competes_with_what_waits() -> None:
+    """A frame sent in receive() is there when the bus becomes idle at that instant."""
+    loop = Loop(media())
+    loop.connect(Script("a", [], (0, 0, Frame(0x10, b"")), (10, 0, Frame(0x111, b""))), loop.media)
+    loop.connect(Echo("b", []), loop.media)
+    loop.run_until(190_000)
+    assert [row[3] for row in rows(loop)] == [0x10, 0x110, 0x111]
+
+
+SENDS = st.lists(
+    st.tuples(st.integers(0, 2_000_000), st.integers(0, 2), st.integers(0, 0x7FF), st.binary(max_size=8)), max_size=40
+)
+
+
+def reference(sends: list[tuple[int, int, int, bytes]]) -> list[tuple[int, int, int]]:
+    """One bus, worked out frame by frame: (end, sender, id)."""
+    pending = sorted(sends, key=lambda item: (item[0], item[1]))
+    found = []
+    free_at = 0
+    while pending:
+        start = max(free_at, pending[0][0])
+        arrived = [item for item in pending if item[0] <= start]
+        winner = min(arrived, key=lambda item: item[2])  # the first of equal ids
+        pending.remove(winner)
+        free_at = start + Frame(winner[2], winner[3]).measure() * BIT
+        found.append((free_at, winner[1], winner[2]))
+    return found
+
+
+@given(sends=SENDS)
+def test_one_bus_carries_frames_as_the_rule_says(sends: list[tuple[int, int, int, bytes]]) -> None:
+    """Wire rules: lowest id wins, losers retry at the next bus idle, next start = max(end, arrival)."""
+    loop = Loop(media())
+    for node in range(3):
+        mine = [(time, 0, Frame(can_id, data)) for time, sender, can_id, data in sends if sender == node]
+        loop.connect(Script(str(node), [], *mine), loop.media)
+    loop.run_until(20_000_000)
+    assert [(end, sender, can_id) for end, _, sender, can_id in rows(loop)] == reference(sends)
+
+
+# --- order -------------------------------------------------------------------------------------------------------
+
+
+def test_frame_comes_before_the_wake_up_of_the_same_nanosecond() -> None:
+    """Design: at the same ns, frame before wake-up."""
+    log: list[Call] = []
+    loop = Loop(media())
+    end = duration(1)
+    loop.connect(Script("a", log, (end, 0, Frame(2, b""))), loop.media)  # woken first by index, but after the frame
+    loop.connect(Script("b", log, (0, 0, Frame(1, b""))), loop.media)
+    loop.run_until(end)
+    assert [call[:3] for call in log] == [("b", "wake", 0), ("a", "frame", end), ("a", "wake", end)]
+
+
+@pytest.mark.parametrize("early", [1, 2])
+def test_wake_up_before_the_frame_comes_first(early: int) -> None:
+    """One nanosecond is enough."""
+    log: list[Call] = []
+    loop = Loop(media())
+    end = duration(1)
+    loop.connect(Script("a", log, (end - early, 0, Frame(2, b""))), loop.media)
+    loop.connect(Script("b", log, (0, 0, Frame(1, b""))), loop.media)
+    loop.run_until(end)
+    assert [call[:3] for call in log] == [("b", "wake", 0), ("a", "wake", end - early), ("a", "frame", end)]
+
+
+def test_frames_of_one_nanosecond_come_in_bus_order() -> None:
+    """Design: at the same ns by bus; the order of connecting and of ids does not matter."""
+    log: list[Call] = []
+    loop = Loop(media(3))
+    ids = [0x155, 0x0AA, 0x2AA]
+    assert len({duration(can_id, 4) for can_id in (0x0AA,)}) == 1
+    ends = [duration(can_id, 4) for can_id in ids]
+    starts = [max(ends) - end for end in ends]
+    loop.connect(Script("listener", log), [loop.media[2], loop.media[0], loop.media[1]])
+    for bus in (1, 2, 0):
+        loop.connect(Script(f"talker {bus}", [], (starts[bus], 0, Frame(ids[bus], bytes(4)))), [loop.media[bus]])
+    loop.run_until(max(ends))
+    assert [row[:2] for row in rows(loop)] == [(max(ends), 0), (max(ends), 1), (max(ends), 2)]
+    assert [call[3] for call in log] == [1, 2, 0]  # the listener's port on bus 0, 1, 2
+
+
+def test_nodes_hear_a_frame_in_the_order_they_were_connected() -> None:
+    """Same instant, same frame: order of connecting."""
+    log: list[Call] = []
+    loop = Loop(media())
+    for name in ("c", "a", "b"):
+        loop.connect(Script(name, log), loop.media)
+    loop.connect(Script("talker", [], (0, 0, Frame(1, b""))), loop.media)
+    loop.run_until(1_000_000)
+    assert [call[0] for call in log] == ["c", "a", "b"]
+
+
+def test_nodes_are_woken_in_the_order_they_were_connected() -> None:
+    """Same instant: order of connecting."""
+    log: list[Call] = []
+    loop = Loop(media())
+    for name in ("c", "a", "b"):
+        loop.connect(Script(name, log, (5, 0, Frame(1, b""))), loop.media)
+    loop.run_until(5)
+    assert [call[:3] for call in log] == [("c", "wake", 5), ("a", "wake", 5), ("b", "wake", 5)]
+
+
+def test_node_made_due_by_a_frame_is_woken_in_the_same_instant() -> None:
+    """`wake_at` is read afresh before every wait."""
+
+    class Prompt(Script):
+        def receive(self, now: int, port: int, frame: Frame, out: Out) -> None:
+            super().receive(now, port, frame, out)
+            self.wake_at = now
+
+    log: list[Call] = []
+    loop = Loop(media())
+    loop.connect(Prompt("a", log), loop.media)
+    loop.connect(Script("b", [], (0, 0, Frame(1, b""))), loop.media)
+    loop.run_until(duration(1))
+    assert [call[:3] for call in log] == [("a", "frame", duration(1)), ("a", "wake", duration(1))]
+
+
+def test_node_that_puts_off_its_wake_up_is_not_woken() -> None:
+    """`wake_at` is read afresh before every wait, also when a frame moved it to later."""
+
+    class Watchdog(Script):
+        def receive(self, now: int, port: int, frame: Frame, out: Out) -> None:
+            super().receive(now, port, frame, out)
+            self.wake_at = now + 100_000
+
+        def wake(self, now: int, out: Out) -> None:
+            super().wake(now, out)
+            self.wake_at = NEVER
+
+    log: list[Call] = []
+    loop = Loop(media())
+    watchdog = Watchdog("dog", log)
+    watchdog.wake_at = 100_000
+    loop.connect(watchdog, loop.media)
+    loop.connect(Script("b", [], (0, 0, Frame(1, b"")), (90_000, 0, Frame(1, b""))), loop.media)
+    loop.run_until(1_000_000)
+    last = 90_000 + duration(1)
+    assert [call[1:3] for call in log] == [("frame", duration(1)), ("frame", last), ("wake", last + 100_000)]
+
+
+# --- who hears what ----------------------------------------------------------------------------------------------
+
+
+def test_sender_does_not_hear_its_own_frame() -> None:
+    """A CAN controller does not receive what it sends."""
+    log: list[Call] = []
+    loop = Loop(media())
+    loop.connect(Script("a", log, (0, 0, Frame(1, b""))), loop.media)
+    loop.run_until(1_000_000)
+    assert [call[1] for call in log] == ["wake"]
+    assert len(loop.trace) == 1
+
+
+def test_node_with_several_ports_on_a_bus_is_called_once() -> None:
+    """Design: one rack call per SYNC, not six; it hears on the first of its ports."""
+    log: list[Call] = []
+    loop = Loop(media())
+    loop.connect(Script("rack", log), [loop.media[0]] * 6)
+    loop.connect(Script("master", [], (0, 0, Frame(0x80, b"\1"))), loop.media)
+    loop.run_until(1_000_000)
+    assert log == [("rack", "frame", Frame(0x80, b"\1").measure() * BIT, 0, "080#01")]
+
+
+@pytest.mark.parametrize(("sends_on", "hears_on"), [(0, 1), (1, 0), (5, 0)])
+def test_frame_of_one_port_is_heard_on_the_first_other_port_of_the_node(sends_on: int, hears_on: int) -> None:
+    """Design: frames sent by one of six drives are delivered to the other five; the rack is called once."""
+    log: list[Call] = []
+    loop = Loop(media())
+    loop.connect(Script("rack", log, (0, sends_on, Frame(0x181, b""))), [loop.media[0]] * 6)
+    loop.connect(Script("master", log), loop.media)
+    loop.run_until(1_000_000)
+    assert [(call[0], call[3]) for call in log if call[1] == "frame"] == [("rack", hears_on), ("master", 0)]
+
+
+def test_node_on_two_buses_is_told_the_port() -> None:
+    """Port k of a node is attached to the k-th medium given."""
+    log: list[Call] = []
+    loop = Loop(media(2))
+    loop.connect(Script("gateway", log), [loop.media[1], loop.media[0]])
+    loop.connect(Script("a", log, (0, 0, Frame(1, b""))), [loop.media[0]])
+    loop.connect(Script("b", log, (0, 0, Frame(2, bytes(8)))), [loop.media[1]])
+    loop.run_until(1_000_000)
+    heard = [(call[0], call[3], call[4][:3]) for call in log if call[1] == "frame"]
+    assert heard == [("gateway", 1, "001"), ("gateway", 0, "002")]
+
+
+# --- running -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("until", "served"), [(-1, 0), (0, 1), (1, 1)])
+def test_run_until_is_inclusive_for_wake_ups(until: int, served: int) -> None:
+    """`run_until` serves every instant up to and including the one given."""
+    log: list[Call] = []
+    loop = Loop(media())
+    loop.connect(Script("a", log, (1_000, 0, Frame(1, b""))), loop.media)
+    loop.run_until(1_000 + until)
+    assert len(log) == served
+    assert loop.now == 1_000 + until
+
+
+@pytest.mark.parametrize(("until", "served"), [(-1, 0), (0, 1), (1, 1)])
+def test_run_until_is_inclusive_for_frames(until: int, served: int) -> None:
+    """The same for a frame that ends then."""
+    log: list[Call] = []
+    loop = Loop(media())
+    loop.connect(Script("a", [], (0, 0, Frame(1, b""))), loop.media)
+    loop.connect(Script("b", log), loop.media)
+    loop.run_until(duration(1) + until)
+    assert len(log) == served
+    assert len(loop.trace) == served
+
+
+@given(sends=SENDS, stops=st.lists(st.integers(0, 3_000_000), max_size=10))
+def test_stopping_in_between_changes_nothing(
+    sends: list[tuple[int, int, int, bytes]], stops: list[int]
+) -> None:
+    """Many calls of `run_until` give the trace of one."""
+
+    def run(times: list[int]) -> str:
+        loop = Loop(media(2))
+        for node in range(3):
+            mine = [(time, node % 2, Frame(can_id, data)) for time, sender, can_id, data in sends if sender == node]
+            loop.connect(Script(str(node), [], *mine), loop.media)
+        for time in times:
+            loop.run_until(time)
+        return trace_hash(loop.trace)
+
+    assert run([*sorted(stops), 20_000_000]) == run([20_000_000])
+
+
+def test_same_nodes_give_the_same_trace_and_the_same_calls() -> None:
+    """Style: same scenario, same trace hash."""
+
+    def run() -> tuple[str, list[Call]]:
+        log: list[Call] = []
+        loop = Loop(media(2))
+        for node in range(4):
+            sends = [(time * 37_001 * (node + 1), 0, Frame(0x100 + node, bytes((time,)))) for time in range(50)]
+            loop.connect(Echo(str(node), log, *sends) if node == 0 else Script(str(node), log, *sends), loop.media)
+        loop.run_until(10_000_000)
+        return trace_hash(loop.trace), log
+
+    assert run() == run()
+
+
+def test_frame_queued_between_two_calls_starts_at_the_present_time() -> None:
+    """What is queued from outside competes at the instant the loop stands at."""
+    loop = Loop(media())
+    loop.connect(Script("a", []), loop.media)
+    loop.run_until(5_000)
+    loop.outs[0].send(0, Frame(1, b""))
+    loop.run_until(1_000_000)
+    assert rows(loop) == [(5_000 + duration(1), 0, 0, 1)]
+
+
+def test_running_backwards_is_refused() -> None:
+    """Time does not go back: a call with an earlier time is a programming error."""
+    loop = Loop(media())
+    loop.run_until(10)
+    loop.run_until(10)
+    with pytest.raises(CanopenExoError, match="9 ns given, it is 10 ns"):
+        loop.run_until(9)
+    assert loop.now == 10
+
+
+def test_node_that_does_not_move_its_wake_up_is_refused() -> None:
+    """`wake` must move `wake_at` on; the message says which node, and the loop does not hang."""
+
+    class Stuck(Node):
+        def wake(self, now: int, out: Out) -> None:
+            pass
+
+    loop = Loop(media())
+    loop.connect(Script("fine", []), loop.media)
+    stuck = Stuck()
+    stuck.wake_at = 42
+    loop.connect(stuck, loop.media)
+    with pytest.raises(CanopenExoError, match=r"node 1 \(Stuck\) asks to be woken at 42 ns again, it is 42 ns"):
+        loop.run_until(100)
+
+
+@pytest.mark.parametrize("asks", [-1, 0, 9])
+def test_node_that_asks_for_the_past_is_refused(asks: int) -> None:
+    """A wake-up that is over cannot be served at its time."""
+    loop = Loop(media())
+    node = Node()
+    loop.connect(node, loop.media)
+    loop.run_until(10)
+    node.wake_at = asks
+    with pytest.raises(CanopenExoError, match=f"asks to be woken at {asks} ns, it is 10 ns"):
+        loop.run_until(100)
+
+
+# --- a broken cable ----------------------------------------------------------------------------------------------
+
+
+def test_cut_bus_carries_nothing_until_it_is_mended() -> None:
+    """The frame on the wire is lost, time goes on, the queue empties after mending, and the other bus never noticed."""
+    log: list[Call] = []
+    loop = Loop(media(2))
+    sends = [(at * 100_000, port, Frame(0x100 + at, b"")) for at in range(6) for port in range(2)]
+    loop.connect(Script("a", [], *sends), loop.media)
+    loop.connect(Script("b", log), loop.media)
+    loop.run_until(110_000)  # 101 is on both wires
+    loop.media[0].cut()
+    loop.run_until(310_000)
+    loop.media[0].mend()
+    loop.run_until(1_000_000)
+    assert [row[3] for row in rows(loop) if row[1] == 0] == [0x100, 0x102, 0x103, 0x104, 0x105]
+    assert [row[3] for row in rows(loop) if row[1] == 1] == [0x100, 0x101, 0x102, 0x103, 0x104, 0x105]
+    first = next(row for row in rows(loop) if row[1:] == (0, 0, 0x102))
+    assert first[0] == 310_000 + duration(0x102)
+
+
+def test_node_may_cut_the_bus_while_it_is_called() -> None:
+    """A cut from inside takes effect at once: what was sent in that instant waits."""
+
+    class Cutter(Script):
+        def __init__(self, medium: Medium) -> None:
+            super().__init__("cutter", [])
+            self.medium = medium
+
+        def receive(self, now: int, port: int, frame: Frame, out: Out) -> None:
+            self.medium.cut()
+            out.send(port, Frame(3, b""))
+
+    loop = Loop(media())
+    loop.connect(Cutter(loop.media[0]), loop.media)
+    loop.connect(Script("a", [], (0, 0, Frame(1, b"")), (1, 0, Frame(2, b""))), loop.media)
+    loop.run_until(1_000_000)
+    assert [row[3] for row in rows(loop)] == [1]
+    assert [port.queued for port in loop.media[0].ports] == [1, 1]
