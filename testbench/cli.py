@@ -40,7 +40,7 @@ def _parser() -> argparse.ArgumentParser:
     verbs = parser.add_subparsers(title="verbs", metavar="VERB", required=True)
 
     run = verbs.add_parser("run", help="golden run + faulted run, verdict", description=_run.__doc__)
-    run.add_argument("scenario", type=Path, metavar="SCENARIO.yaml")
+    run.add_argument("scenario", type=Path, metavar="SCENARIO.yaml", help="what to run; see scenarios/")
     run.add_argument("--seed", metavar="N", help="instead of the scenario's seed")
     run.add_argument("--out", type=Path, metavar="DIR", help="result folder (default: results/NAME-SEED)")
     run.add_argument(
@@ -55,12 +55,12 @@ def _parser() -> argparse.ArgumentParser:
     run.set_defaults(verb=_run)
 
     check = verbs.add_parser("check", help="validate a scenario and say what it will do", description=_check.__doc__)
-    check.add_argument("scenario", type=Path, metavar="FILE")
+    check.add_argument("scenario", type=Path, metavar="FILE", help="a scenario file")
     check.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="overrides", help="as for run")
     check.set_defaults(verb=_check)
 
     export = verbs.add_parser("export", help="write files for other tools", description=_export.__doc__)
-    export.add_argument("what", choices=("eds", "dbc", "schema"))
+    export.add_argument("what", choices=("eds", "dbc", "schema"), help="which of them")
     export.set_defaults(verb=_export)
     return parser
 
@@ -97,7 +97,7 @@ def _run(options: argparse.Namespace) -> int:
         folder = options.out or default_folder(scenario.name, scenario.seed)
         check_folder(folder)
     except (FileErrors, BenchError) as error:
-        _say(str(error))
+        _say(str(error) if options.seed is None else str(error).replace("--set seed=", "--seed "))
         return USAGE
     for warning in scenario.warnings:
         _say(f"warning: {warning}")

@@ -126,7 +126,9 @@ def record_of(rig: Rig) -> RunRecord:
     zero = controller.time_zero
     if zero == NEVER or rig.gateway.time_zero == NEVER or not controller.samples:
         reasons = "; ".join(f"{event.joint + ': ' if event.joint else ''}{event.text}" for event in controller.events)
-        raise NotStartedError(f"the motion never began: {reasons or 'the bus carried no status of the controller'}")
+        which = "faulted run" if rig.gateway.injectors else "golden run"
+        reasons = reasons or "the bus carried no status of the controller"
+        raise NotStartedError(f"{which}: the motion never began: {reasons}")
     rows = [row for row in rig.rack.truth if zero <= row.time_ns <= zero + params.duration_ns]
     truth = Truth(
         np.array([row.time_ns - zero for row in rows]) / 1e9,

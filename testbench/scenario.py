@@ -151,7 +151,7 @@ class Rig(SpecModel):
         BeforeValidator(_cycle),
         PlainSerializer(_rate),
         WithJsonSchema({"type": "string", "examples": ["500 Hz"]}),
-        Field(alias="rate"),
+        Field(alias="rate", json_schema_extra={"default": "500 Hz"}),
     ] = 2 * MS
 
 
@@ -179,7 +179,9 @@ class Scenario(SpecModel):
     injectors: dict[str, InjectorSpec] = field(default_factory=dict)
     expect: tuple[ExpectLine, ...] = ()
     fail_on: Literal["failure", "error"] = "failure"
-    tolerance_rad: Annotated[Angle, AfterValidator(_tolerance), Field(alias="tolerance")] = 0.0
+    tolerance_rad: Annotated[
+        Angle, AfterValidator(_tolerance), Field(alias="tolerance", json_schema_extra={"default": "0 deg"})
+    ] = 0.0
 
     @property
     def plan(self) -> BusPlan:

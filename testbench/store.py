@@ -1,14 +1,17 @@
 """The result folder: written whole, or not at all.
 
-Everything is written into a new folder beside the target (`.<name>.<n>.part`), flushed to the disk, and put in place by
-renaming. A previous result is moved aside first and removed last; anything else that stands there is left alone and
-refused. When writing fails or is interrupted, the half-written folder is removed and the previous result is back.
-After a power cut between the two renames the previous result is left in `.<name>.<n>.old`, whole.
+Everything is written into a new folder beside the target (`.<name>.<writer>.<n>.part`), flushed to the disk, and put in
+place by renaming. A previous result is moved aside first and removed last; anything else that stands there is left
+alone and refused. When writing fails or is interrupted, the half-written folder is removed and the previous result is
+back. What a killed process left half-written is removed by the next one that writes to the same place.
+After a power cut between the two renames the previous result is left in `.<name>.<writer>.<n>.old`, whole.
 """
 
 import os
+import platform
 import re
 import shutil
+import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -102,6 +105,7 @@ def write_result(folder: Path, files: Mapping[str, Writer]) -> Path:
     folder = _resolved(folder)
     try:
         with _parents(folder.parent):
+            _remove_left_over(folder)
             part = _new_folder(folder, "part")
             try:
                 for name, write in files.items():
@@ -156,13 +160,40 @@ def _new_folder(folder: Path, end: str) -> Path:
     """A new folder beside `folder`, with the usual permissions; nobody else gets the same."""
     number = 0
     while True:
-        made = folder.with_name(f".{folder.name}.{number}.{end}")
+        made = folder.with_name(f".{folder.name}.{_machine()}-{os.getpid()}.{number}.{end}")
         try:
             made.mkdir()
         except FileExistsError:
             number += 1
         else:
             return made
+
+
+def _remove_left_over(folder: Path) -> None:
+    """Remove what processes of this machine that are no more left half-written for this folder."""
+    if os.name == "nt":  # there is no harmless way to ask for a process
+        return
+    written = re.compile(rf"\.{re.escape(folder.name)}\.{_machine()}-([0-9]{{1,9}})\.[0-9]+\.part", re.ASCII)
+    with suppress(OSError):  # a folder one may write in and not read
+        for entry in list(folder.parent.iterdir()):
+            match = written.fullmatch(entry.name)
+            if match is not None and not _is_alive(int(match[1])):
+                shutil.rmtree(entry, ignore_errors=True)
+
+
+def _is_alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)  # asks only
+    except PermissionError:  # alive, and somebody else's
+        return True
+    except (OSError, OverflowError):
+        return False
+    return True
+
+
+def _machine() -> str:
+    """This machine, in eight digits: on a shared disk, other machines write too."""
+    return f"{zlib.crc32(platform.node().encode()):08x}"
 
 
 def _resolved(folder: Path) -> Path:

@@ -21,7 +21,7 @@ from testbench.golden import JointComparison
 from testbench.record import RunRecord
 from testbench.verdict import UNITS, Judgement, Violation
 
-MOST_LINES: Final = 25
+MOST_LINES: Final = 28
 """Lines of `summary_text`: what fits on a small terminal with the prompt."""
 
 
@@ -317,7 +317,8 @@ def _outcome_text(document: Summary) -> str:
 
 
 def _event_line(event: EventEntry) -> str:
-    return f"      at {event['time_s']:.3f} s  {event['node']}: {event['text']}"
+    line = f"      at {event['time_s']:.3f} s  {event['node']}: {event['text']}"
+    return line if len(line) <= 100 else f"{line[:97]}..."
 
 
 def _injection_lines(document: Summary) -> list[str]:

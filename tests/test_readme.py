@@ -12,6 +12,8 @@ from pathlib import Path
 
 import pytest
 
+from testbench.scenario import parse_scenario
+
 ROOT = Path(__file__).resolve().parent.parent
 README = ROOT / "README.md"
 CONSOLE = re.compile(r"```console\n\$ (.*)\n((?:(?!```).*\n)*)```")
@@ -60,6 +62,15 @@ def test_the_scenario_shown_is_the_file() -> None:
     """A scenario printed in the README is the one that is shipped."""
     for name, text in YAML.findall(README.read_text(encoding="utf-8")):
         assert (ROOT / name).read_text(encoding="utf-8") == text
+
+
+def test_the_injector_shown_in_the_reference_reads() -> None:
+    """docs/scenarios.md: its YAML is an injector of a scenario."""
+    shown = re.findall(r"```yaml\n(.*?)```", (ROOT / "docs" / "scenarios.md").read_text(encoding="utf-8"), re.DOTALL)
+    head = "name: shown\nrig: {plant: suspended, stops: off}\nmotion: {gait: walking, stride: 1.5 s, duration: 7 s}\n"
+    assert shown
+    for text in shown:
+        assert parse_scenario(head + text).injectors
 
 
 def renew() -> None:
