@@ -394,6 +394,17 @@ def test_drive_does_not_start_again_by_itself_when_the_connection_is_back() -> N
     assert (joint.state, joint.drive.torque_nm) == (DISABLED, 0.0)
 
 
+def test_held_shutdown_acts_again_after_the_drive_disabled_itself() -> None:
+    """Commands of the controlword are levels (only fault reset is an edge): a master that holds 0x06 gets Ready."""
+    joint = supervised(2)
+    joint.command(0x06)
+    assert joint.state == READY
+    joint.pass_time(10 * MS)
+    assert joint.state == DISABLED
+    joint.command(0x06)
+    assert joint.state == READY
+
+
 def test_sync_that_comes_back_is_told_at_once() -> None:
     """CiA 301, 7.2.7: EMCY 0000 with the SYNC that ends the loss, not with some later timer."""
     joint = supervised(2)

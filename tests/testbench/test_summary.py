@@ -50,7 +50,7 @@ def test_document_has_every_key_of_the_contract(failed: Summary) -> None:
     assert list(read["joints"]) == list(SIX)
     assert set(read["joints"]["right_knee"]) == {
         *("rmse_position_rad", "rmse_velocity_rad_s", "rmse_torque_nm", "min_angle_deg", "max_angle_deg"),
-        *("max_speed_rpm", "max_torque_nm"),
+        *("max_speed_rpm", "max_torque_nm", "held_cycles"),
     }
     assert list(read["golden"]["tracking_rmse_rad"]) == list(SIX)
     assert set(read["failures"][0]) == {"joint", "kind", "time_s", "value", "limit"}

@@ -180,7 +180,6 @@ def test_frames_of_one_nanosecond_come_in_bus_order() -> None:
     log: list[Call] = []
     loop = Loop(media(3))
     ids = [0x155, 0x0AA, 0x2AA]
-    assert len({duration(can_id, 4) for can_id in (0x0AA,)}) == 1
     ends = [duration(can_id, 4) for can_id in ids]
     starts = [max(ends) - end for end in ends]
     loop.connect(Script("listener", log), [loop.media[2], loop.media[0], loop.media[1]])
@@ -371,7 +370,7 @@ def test_running_backwards_is_refused() -> None:
     loop = Loop(media())
     loop.run_until(10)
     loop.run_until(10)
-    with pytest.raises(CanopenExoError, match="9 ns given, it is 10 ns"):
+    with pytest.raises(CanopenExoError, match="run until 9 ns given, it is 10 ns"):
         loop.run_until(9)
     assert loop.now == 10
 

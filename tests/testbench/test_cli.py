@@ -1,0 +1,609 @@
+"""The command line seen from outside: what is printed where, exit codes, the result folder, exports, help."""
+
+import json
+import re
+import signal
+import subprocess
+import sys
+import tomllib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import canopen
+import cantools
+import pytest
+from cantools.database.can import Database
+from PIL import Image
+
+import testbench.cli
+import testbench.run
+from canopen_exo.plan import BusPlan
+from fi_gateway.marked_yaml import Data, load
+from testbench.cli import main
+from testbench.scenario import JOINT_NAMES, default_joints, load_scenario
+from testbench.store import FILES
+
+ROOT = Path(__file__).parents[2]
+SCENARIOS = ROOT / "scenarios"
+KNEE = str(SCENARIOS / "knee_freeze_at.yaml")
+GOLDEN = str(SCENARIOS / "golden.yaml")
+
+# A short motion with a whole fault window in it.
+SHORT = ["--seed", "7"]
+for override in (
+    "motion.duration=0.5s",
+    "injectors.freeze_position.event.time=0.1s",
+    "injectors.freeze_position.effect.duration=0.2s",
+    "injectors.zero_velocity.effect.duration=0.2s",
+):
+    SHORT += ["--set", override]
+
+# The program, with the interrupt key at work also where this test runs in the background of a shell.
+PROGRAM = (
+    "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
+    "from testbench.cli import main; sys.exit(main())"
+)
+
+
+def exo_hil(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """The program in a process of its own, started in `folder`."""
+    command = [sys.executable, "-c", PROGRAM, *arguments]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+@pytest.fixture(scope="module")
+def short(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, subprocess.CompletedProcess[str]]:
+    """A short faulted run, printed as JSON, into the default place: the directory it began in, and the process."""
+    folder = tmp_path_factory.mktemp("short")
+    return folder, exo_hil(folder, "run", KNEE, "--json", *SHORT)
+
+
+# --- what is printed -----------------------------------------------------------------------------------------------
+
+
+def refuse_constant(text: str) -> float:
+    raise AssertionError(f"{text} is not JSON")
+
+
+@pytest.mark.run
+def test_stdout_is_one_strict_json_document_and_stderr_the_talk(
+    short: tuple[Path, subprocess.CompletedProcess[str]],
+) -> None:
+    """Design: stdout = result (`--json`: one JSON document), stderr = talk; no NaN, no Infinity."""
+    folder, done = short
+    document = json.loads(done.stdout, parse_constant=refuse_constant)
+    assert isinstance(document, dict)
+    assert done.stdout.endswith("}\n")
+    assert done.stderr == f"result folder: {folder / 'results' / 'knee_freeze_at-7'}\n"
+
+
+HASH = re.compile(r"[0-9a-f]{64}")
+NUMBER = (int, float)
+JOINT_KEYS = (
+    *("rmse_position_rad", "rmse_velocity_rad_s", "rmse_torque_nm"),
+    *("min_angle_deg", "max_angle_deg", "max_speed_rpm", "max_torque_nm"),
+)
+
+
+def check_types(entry: dict[str, object], types: dict[str, type | tuple[type, ...]]) -> None:
+    """Every key is there with its type; a switch is no number."""
+    for key, kind in types.items():
+        assert isinstance(entry[key], kind), key
+        assert kind is bool or not isinstance(entry[key], bool), key
+
+
+@pytest.mark.run
+def test_document_has_the_keys_of_the_design(short: tuple[Path, subprocess.CompletedProcess[str]]) -> None:
+    """Design, "Command line": the keys that `run --json` prints at least, with their types."""
+    document = json.loads(short[1].stdout)
+    check_types(document, {"scenario": str, "seed": int, "valid": bool, "verdict": str, "outcome": str})
+    check_types(document, dict.fromkeys(("sim_time_s", "wall_time_s", "x_realtime"), NUMBER))
+    check_types(document, dict.fromkeys(("bus", "trace_hash", "joints", "golden"), dict))
+    check_types(document, dict.fromkeys(("injections", "errors", "failures"), list))
+    assert document["verdict"] in ("pass", "fail")
+    assert document["x_realtime"] == pytest.approx(document["sim_time_s"] / document["wall_time_s"])
+    assert set(document["bus"]) == {"controller", "drive"}
+    for bus in document["bus"].values():
+        check_types(bus, {"frames": int, "load": float})
+    assert set(document["trace_hash"]) == {"golden", "faulted"}
+    assert all(HASH.fullmatch(text) for text in document["trace_hash"].values())
+    assert list(document["joints"]) == list(JOINT_NAMES)
+    for joint in document["joints"].values():
+        check_types(joint, dict.fromkeys(JOINT_KEYS, NUMBER))
+    check_types(document["golden"]["tracking_rmse_rad"], dict.fromkeys(JOINT_NAMES, NUMBER))
+    assert len(document["injections"]) == 2
+    for injection in document["injections"]:
+        check_types(injection, {"injector": str, "signal": str, "cause": str, "frames": int})
+        check_types(injection, {"start_s": NUMBER, "end_s": NUMBER})
+
+
+@pytest.mark.run
+def test_errors_and_failures_have_the_keys_of_the_design(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """errors: joint, kind, time, value, limit; failures the same; a failure ends in exit code 1."""
+    monkeypatch.chdir(tmp_path)
+    freeze = [*SHORT, "--set", "injectors.freeze_position.event.time=0.7s", "--set", "motion.duration=1.2s"]
+    longer = [f"injectors.{name}.effect.duration=0.4s" for name in ("freeze_position", "zero_velocity")]
+    assert main(["run", KNEE, "--json", *freeze, "--set", longer[0], "--set", longer[1], "--out", "r"]) == 1
+    document = json.loads(capsys.readouterr().out)
+    assert (document["verdict"], document["outcome"]) == ("fail", "failure")
+    assert document["errors"]
+    assert document["failures"]
+    for entry in (*document["errors"], *document["failures"]):
+        check_types(entry, {"joint": str, "kind": str, "time_s": NUMBER, "value": NUMBER, "limit": NUMBER})
+        assert entry["joint"] in JOINT_NAMES
+        assert 0 <= entry["time_s"] <= 1.2
+    assert {entry["kind"] for entry in document["errors"]} <= {"torque", "speed"}
+    assert {entry["kind"] for entry in document["failures"]} <= {"min_angle", "max_angle"}
+
+
+@pytest.mark.run
+def test_seed_and_set_change_what_is_run(short: tuple[Path, subprocess.CompletedProcess[str]]) -> None:
+    """`--seed N` instead of the scenario's; `--set` by dotted path, injectors by name, for run as for the record."""
+    folder, done = short
+    document = json.loads(done.stdout)
+    assert document["seed"] == 7
+    assert document["duration_s"] == 0.5
+    for injection in document["injections"]:
+        assert injection["start_s"] == pytest.approx(0.1, abs=1e-9)  # times are whole ns, told in s
+        assert injection["end_s"] == pytest.approx(0.3, abs=1e-9)
+        assert injection["frames_seen"] == 100  # 0.2 s at 500 Hz
+    read = load_scenario(folder / "results" / "knee_freeze_at-7" / "scenario.yaml")
+    assert read == load_scenario(KNEE, ["seed=7", *SHORT[3::2]])
+    assert read.injectors["freeze_position"].effect.mean_ns() == 200_000_000
+
+
+# --- the result folder ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.run
+def test_result_folder_holds_what_the_design_lists(short: tuple[Path, subprocess.CompletedProcess[str]]) -> None:
+    """scenario.yaml, summary.json, a candump log per bus, joint traces as Parquet, plots as PNG; nothing beside it."""
+    folder, done = short
+    result = folder / "results" / "knee_freeze_at-7"
+    assert done.returncode == 0, done.stderr
+    assert names(folder) == ["results"]
+    assert names(folder / "results") == ["knee_freeze_at-7"]
+    assert set(names(result)) == FILES
+    assert (result / "summary.json").read_text(encoding="utf-8") == done.stdout
+    for path in result.glob("*.png"):
+        assert path.read_bytes().startswith(b"\x89PNG\r\n\x1a\n")
+        with Image.open(path) as image:
+            image.verify()
+    for path in result.glob("*.parquet"):
+        data = path.read_bytes()
+        assert data[:4] == data[-4:] == b"PAR1"
+    for path in result.glob("*.log"):
+        assert path.read_text(encoding="ascii").startswith("(")
+
+
+@pytest.fixture
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty working directory."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.run
+def test_next_result_replaces_the_previous_one(place: Path) -> None:
+    """The same place twice: the second result, whole, and nothing left of the first."""
+    for seed in ("1", "2"):
+        assert main(["run", GOLDEN, "--set", "motion.duration=0.1s", "--seed", seed, "--out", "r"]) == 0
+        document = json.loads((place / "r" / "summary.json").read_text(encoding="utf-8"))
+        assert document["seed"] == int(seed)
+    assert names(place) == ["r"]
+
+
+@pytest.fixture
+def nothing_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The simulation must not be reached."""
+
+    def run(*arguments: object) -> None:
+        raise AssertionError("the scenario was run")
+
+    monkeypatch.setattr(testbench.run, "run_scenario", run)
+
+
+def refused(capsys: pytest.CaptureFixture[str], out: str) -> str:
+    assert main(["run", GOLDEN, "--out", out]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith("result folder ")
+    assert "--out" in captured.err  # the remedy
+    return captured.err
+
+
+@pytest.mark.usefixtures("nothing_runs")
+def test_folder_of_somebody_else_is_refused_before_the_run(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Only a previous result is replaced; what else stands there is named, and stays."""
+    (place / "thesis").mkdir()
+    (place / "thesis" / "chapter1.tex").write_text("mine")
+    assert "it holds 'chapter1.tex'" in refused(capsys, "thesis")
+    assert (place / "thesis" / "chapter1.tex").read_text() == "mine"
+    assert names(place / "thesis") == ["chapter1.tex"]
+
+
+@pytest.mark.usefixtures("nothing_runs")
+@pytest.mark.parametrize("out", ["file", "file/below", "file/far/below"])
+def test_place_that_cannot_be_a_folder_is_refused_before_the_run(
+    place: Path, capsys: pytest.CaptureFixture[str], out: str
+) -> None:
+    """A file where the folder, or one above it, should be: told before minutes of simulation, not after."""
+    (place / "file").write_text("mine")
+    assert "file" in refused(capsys, out)
+    assert (place / "file").read_text() == "mine"
+    assert names(place) == ["file"]
+
+
+@pytest.mark.usefixtures("nothing_runs")
+def test_place_without_permission_is_refused_before_the_run(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A parent one may not write in: told before the run."""
+    (place / "locked").mkdir(mode=0o500)
+    with suppress(OSError):
+        (place / "locked" / "probe").mkdir()
+        pytest.skip("permissions do not hold this user back")
+    assert "no permission to write" in refused(capsys, "locked/r")
+
+
+# --- broken off ----------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def writing(folder: Path) -> Iterator[subprocess.Popen[str]]:
+    """A run whose result is just being written; ended at the latest when the test is."""
+    arguments = ["run", GOLDEN, "--set", "motion.duration=0.1s", "--out", "r"]
+    command = [sys.executable, "-c", PROGRAM, *arguments]
+    process = subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        while not list(folder.glob(".r.*.part")):
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(timeout=0.002)
+                raise AssertionError(f"ended before anything was written: {process.communicate()}")
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+@pytest.mark.run
+@pytest.mark.skipif(sys.platform == "win32", reason="no signals to send")
+def test_killed_run_leaves_no_result_and_the_next_one_no_rubbish(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """kill -9 in the middle of writing: no result folder; a rerun works and clears away what the killed one left."""
+    with writing(place) as process:
+        process.kill()
+        process.wait()
+    assert process.returncode == -signal.SIGKILL
+    assert not (place / "r").exists()
+    assert [name[:3] for name in names(place)] == [".r."]  # hidden, and known by its name
+    assert main(["run", GOLDEN, "--set", "motion.duration=0.1s", "--out", "r", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["valid"] is True
+    assert names(place) == ["r"]
+    assert set(names(place / "r")) == FILES
+
+
+@pytest.mark.run
+@pytest.mark.skipif(sys.platform == "win32", reason="no signals to send")
+def test_run_that_is_still_writing_is_not_disturbed(place: Path) -> None:
+    """Two runs into one place at once: what a living process has written so far is no rubbish, and stays."""
+    with writing(place) as process:
+        process.send_signal(signal.SIGSTOP)
+        others = names(place)
+        assert main(["run", GOLDEN, "--set", "motion.duration=0.1s", "--out", "r"]) == 0
+        assert names(place) == sorted([*others, "r"])
+        process.send_signal(signal.SIGCONT)
+        assert process.wait(timeout=60) == 0
+    assert names(place) == ["r"]
+
+
+@pytest.mark.run
+@pytest.mark.skipif(sys.platform == "win32", reason="no signals to send")
+def test_interrupt_while_writing_leaves_nothing(place: Path) -> None:
+    """Ctrl-C: one line on stderr, nothing on stdout or on the disk, an exit code that is no verdict."""
+    with writing(place) as process:
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=60)
+    assert (out, err) == ("", "interrupted; nothing was written\n")
+    assert process.returncode == 130
+    assert names(place) == []
+
+
+@pytest.mark.run
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.9])
+def test_interrupt_while_simulating_leaves_nothing(
+    place: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, share: float
+) -> None:
+    """Ctrl-C in the golden run or in the faulted one: gone at once, without a trace."""
+
+    @contextmanager
+    def interrupted(name: str) -> Iterator[Callable[[float], None]]:
+        def progress(done: float) -> None:
+            if done >= share:
+                signal.raise_signal(signal.SIGINT)
+
+        before = signal.signal(signal.SIGINT, signal.default_int_handler)
+        try:
+            yield progress
+        finally:
+            signal.signal(signal.SIGINT, before)
+
+    monkeypatch.setattr(testbench.cli, "_progress", interrupted)
+    assert main(["run", GOLDEN, "--set", "motion.duration=0.1s"]) == 130
+    captured = capsys.readouterr()
+    assert (captured.out, captured.err) == ("", "interrupted; nothing was written\n")
+    assert names(place) == []
+
+
+# --- exit codes ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.run
+@pytest.mark.parametrize(
+    ("expectation", "code", "verdict"), [("injections == 0", 0, "PASS"), ("injections == 1", 1, "FAIL")]
+)
+def test_exit_code_is_the_verdict(
+    place: Path, capsys: pytest.CaptureFixture[str], expectation: str, code: int, verdict: str
+) -> None:
+    """0 pass, 1 fail, as for an `expect:` line that is met or not; without --json the text says so first."""
+    short = ["--set", "motion.duration=0.1s", "--set", f"expect=[{expectation}]"]
+    assert main(["run", GOLDEN, *short]) == code
+    captured = capsys.readouterr()
+    assert captured.out.startswith(f"{verdict}  golden, seed 2020: no fault was activated\n")
+    assert captured.err == f"result folder: {place / 'results' / 'golden-2020'}\n"
+
+
+DEAF = """\
+name: deaf
+rig: {plant: suspended, stops: off}
+motion: {gait: walking, stride: 1.5 s, duration: 0.1 s}
+injectors:
+  silence:
+    from: power_up
+    target: {bus: to_controller, cob_id: COB_ID}
+    fault: {type: drop}
+    event: {type: at, time: 0 s}
+    effect: {type: infinite}
+"""
+
+
+@pytest.mark.run
+@pytest.mark.parametrize(
+    ("cob_id", "said"),
+    [
+        ("0x585", "right_knee (node 5): no SDO answer within 0.5 s while reading device type (1000:00)"),
+        ("0x705", "right_knee (node 5): no boot-up message within"),
+        ("0x285", "right_knee: not in Operation enabled after 2 s: no statusword (TPDO2) came"),
+    ],
+    ids=["SDO answers", "boot-up", "statusword"],
+)
+def test_rig_that_cannot_start_is_invalid_and_names_the_drive(
+    place: Path, capsys: pytest.CaptureFixture[str], cob_id: str, said: str
+) -> None:
+    """Exit 3: nothing was proved; which drive did not answer, to what, and in which of the two runs. No result."""
+    (place / "deaf.yaml").write_text(DEAF.replace("COB_ID", cob_id))
+    assert main(["run", "deaf.yaml", "--json"]) == 3
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith("deaf: run invalid: faulted run: the motion never began: ")
+    assert said in captured.err
+    assert captured.err.count("\n") == 1
+    assert names(place) == ["deaf.yaml"]
+
+
+# --- check, export, help -------------------------------------------------------------------------------------------
+
+
+def test_check_says_what_a_scenario_will_do_and_runs_nothing(
+    place: Path, capsys: pytest.CaptureFixture[str], nothing_runs: None
+) -> None:
+    """`check FILE`: in words, with overrides applied; warnings go to stderr."""
+    late = "injectors.freeze_position.event.time=9s"
+    assert main(["check", KNEE, "--set", "injectors.zero_velocity.effect.duration=0.5s"]) == 0
+    captured = capsys.readouterr()
+    assert "position of right_knee (0x185, to_controller) held at its last value for 0.3 s" in captured.out
+    assert "reads 0 rpm for 0.5 s; starts when freeze_position is activated" in captured.out
+    assert captured.err == ""
+    assert main(["check", KNEE, "--set", late]) == 0
+    warnings = capsys.readouterr().err.splitlines()
+    assert warnings[0] == "warning: injectors.freeze_position.event: 9 s comes after the motion has ended at 7 s"
+    assert warnings[1].startswith("warning: injectors.zero_velocity: will stay silent")
+    assert names(place) == []
+
+
+def exported(capsys: pytest.CaptureFixture[str], what: str) -> str:
+    assert main(["export", what]) == 0
+    captured = capsys.readouterr()
+    assert captured.err == ""
+    return captured.out
+
+
+def test_exported_eds_loads_in_canopen(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """`export eds`: an object dictionary other tools can read, with what the bus plan maps."""
+    (tmp_path / "joint.eds").write_text(exported(capsys, "eds"), encoding="utf-8")
+    od = canopen.import_od(str(tmp_path / "joint.eds"))
+    for pdo in BusPlan(default_joints()).pdos:
+        for mapped in pdo.content:
+            assert variable(od, mapped.index).data_type in canopen.objectdictionary.datatypes.INTEGER_TYPES
+            assert len(variable(od, mapped.index)) == mapped.length
+    device_type = variable(od, 0x1000).default
+    assert device_type is not None
+    assert device_type & 0xFFFF == 402  # CiA 301: the profile that the device follows
+
+
+def variable(od: canopen.ObjectDictionary, index: int) -> canopen.objectdictionary.ODVariable:
+    found = od[index]
+    assert isinstance(found, canopen.objectdictionary.ODVariable)
+    return found
+
+
+def test_exported_dbc_loads_in_cantools(capsys: pytest.CaptureFixture[str]) -> None:
+    """`export dbc`: every PDO of every joint, in SI."""
+    dbc = cantools.database.load_string(exported(capsys, "dbc"), "dbc")
+    assert isinstance(dbc, Database)
+    for signal_ in BusPlan(default_joints()).signals():
+        there = dbc.get_message_by_frame_id(signal_.cob_id).get_signal_by_name(signal_.name)
+        assert (there.start, there.length, there.is_signed) == (signal_.start, signal_.length, signal_.signed)
+        assert there.scale == pytest.approx(signal_.scale, rel=1e-12)  # printed with 12 digits and more
+
+
+TYPES: dict[str, type | tuple[type, ...]] = {
+    "object": dict,
+    "array": list,
+    "string": str,
+    "boolean": bool,
+    "number": (int, float),
+    "integer": int,
+    "null": type(None),
+}
+SILENT = {"title", "description", "default", "examples", "discriminator", "$defs"}
+
+
+def fits(schema: dict[str, object], value: Data, root: dict[str, object]) -> bool:
+    """Whether a value fits a JSON Schema; of the keywords, those that occur, any other is refused."""
+    results = [_fits(keyword, wanted, schema, value, root) for keyword, wanted in schema.items()]
+    return all(results)
+
+
+def _fits(keyword: str, wanted: object, schema: dict[str, object], value: Data, root: dict[str, object]) -> bool:
+    def one(inner: object, item: Data) -> bool:
+        assert isinstance(inner, dict)
+        return fits(inner, item, root)
+
+    if keyword in SILENT:
+        return True
+    if keyword == "$ref":
+        definitions = root["$defs"]
+        assert isinstance(definitions, dict)
+        return one(definitions[str(wanted).removeprefix("#/$defs/")], value)
+    if keyword == "type":
+        kinds = [str(kind) for kind in wanted] if isinstance(wanted, list) else [str(wanted)]
+        return any(isinstance(value, TYPES[kind]) and (kind == "boolean") == isinstance(value, bool) for kind in kinds)
+    if keyword == "const":
+        return value == wanted
+    if keyword == "minimum":
+        assert isinstance(wanted, int)
+        return not isinstance(value, int) or value >= wanted
+    if keyword == "required":
+        assert isinstance(wanted, list)
+        return not isinstance(value, dict) or set(wanted) <= set(value)
+    if keyword == "minItems":
+        assert isinstance(wanted, int)
+        return not isinstance(value, list) or len(value) >= wanted
+    if keyword == "items":
+        return not isinstance(value, list) or all(one(wanted, item) for item in value)
+    if keyword == "properties":
+        assert isinstance(wanted, dict)
+        return not isinstance(value, dict) or all(one(wanted[key], value[key]) for key in value if key in wanted)
+    if keyword == "additionalProperties":
+        known = schema.get("properties", {})
+        assert isinstance(known, dict)
+        others = [item for key, item in value.items() if key not in known] if isinstance(value, dict) else []
+        return not others if wanted is False else all(one(wanted, item) for item in others)
+    assert isinstance(wanted, list), f"keyword {keyword} is new to this test"
+    if keyword == "enum":
+        return value in wanted
+    assert keyword in ("anyOf", "oneOf"), f"keyword {keyword} is new to this test"
+    number = sum(one(inner, value) for inner in wanted)
+    return number == 1 if keyword == "oneOf" else number > 0
+
+
+@pytest.mark.parametrize("path", sorted(SCENARIOS.glob("*.yaml")), ids=lambda path: path.stem)
+def test_exported_schema_accepts_the_shipped_scenarios(capsys: pytest.CaptureFixture[str], path: Path) -> None:
+    """`export schema`: what an editor underlines must not be what the program accepts."""
+    schema = json.loads(exported(capsys, "schema"))
+    assert fits(schema, load(path).data, schema)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("seed:", "sede:"),
+        ("name: knee_freeze_at\n", ""),
+        ("stride: 1.5 s", "stride: 1.5"),
+        ("node: right_knee", "nod: right_knee"),
+        ("type: stuck_at}", "type: stuckat}"),
+        ("stops: off", "stops: maybe"),
+        ("any: [freeze_position]", "any: []"),
+        ("injectors:\n", "fail_on: never\ninjectors:\n"),
+    ],
+)
+def test_exported_schema_refuses_what_the_program_refuses(
+    place: Path, capsys: pytest.CaptureFixture[str], old: str, new: str
+) -> None:
+    """Misspelt keys, missing ones, wrong types and unknown words show in an editor already."""
+    schema = json.loads(exported(capsys, "schema"))
+    text = Path(KNEE).read_text(encoding="utf-8")
+    assert old in text
+    (place / "bad.yaml").write_text(text.replace(old, new, 1), encoding="utf-8")
+    assert not fits(schema, load("bad.yaml").data, schema)
+    assert main(["check", "bad.yaml"]) == 2
+
+
+def test_defaults_in_the_exported_schema_fit_it(capsys: pytest.CaptureFixture[str]) -> None:
+    """A default that an editor fills in is one the program reads: "500 Hz", not nanoseconds."""
+    schema = json.loads(exported(capsys, "schema"))
+    found = 0
+    for part in (schema, *schema["$defs"].values()):
+        for key, value in part["properties"].items():
+            if "default" in value:
+                found += 1
+                assert fits(value, value["default"], schema), key
+    assert found >= 5
+
+
+def shown(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    with pytest.raises(SystemExit) as left:
+        main(arguments)
+    assert left.value.code == 0
+    captured = capsys.readouterr()
+    assert captured.err == ""
+    return captured.out
+
+
+@pytest.mark.parametrize(
+    ("verb", "words"),
+    [
+        ("run", ["SCENARIO.yaml", "--seed N", "--out DIR", "--set KEY=VALUE", "--json", "results/NAME-SEED"]),
+        ("check", ["FILE", "--set KEY=VALUE"]),
+        ("export", ["eds", "dbc", "schema"]),
+    ],
+)
+def test_help_of_a_verb_names_all_it_takes(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, verb: str, words: list[str]
+) -> None:
+    """`exo-hil VERB --help`: every option with what it is for; `exo-hil --help` lists the verb and the exit codes."""
+    monkeypatch.setenv("COLUMNS", "100")
+    text = shown(capsys, verb, "--help")
+    assert f"exo-hil {verb}" in text
+    for word in words:
+        assert word in text
+    rows = re.findall(r"^  (\S.*)$", text, re.MULTILINE)
+    assert all(re.search(r"\S  +\S", row) or len(row) > 22 for row in rows), rows  # no option without a word about it
+    general = shown(capsys, "--help")
+    assert re.search(rf"^    {verb} +\w", general, re.MULTILINE)
+    assert "0 pass, 1 verdict fail, 2 usage or bad file, 3 run invalid" in " ".join(general.split())
+
+
+def test_version_is_the_projects(capsys: pytest.CaptureFixture[str]) -> None:
+    """`exo-hil --version` says what is installed."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert shown(capsys, "--version") == f"exo-hil {project['version']}\n"
+
+
+def test_reader_that_has_left_changes_nothing(place: Path) -> None:
+    """`exo-hil export schema | head -1`: no traceback, the exit code of the verb."""
+    command = [sys.executable, "-c", PROGRAM, "export", "schema"]
+    process = subprocess.Popen(command, cwd=place, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    assert process.stderr is not None
+    process.stdout.close()
+    assert process.stderr.read() == ""
+    process.stderr.close()
+    assert process.wait(timeout=60) == 0
