@@ -75,13 +75,7 @@ def decode_controlword(controlword: int) -> DriveCommand | None:
 
 def decode_statusword(statusword: int) -> DriveState | None:
     """The state in a statusword; None for a pattern the standard does not define."""
-    for mask in (0x4F, 0x6F):
-        pattern = statusword & mask
-        for state in DriveState:
-            wide = state in _NARROW
-            if state.value == pattern and wide == (mask == 0x4F):
-                return state
-    return None
+    return _BY_PATTERN.get(statusword & 0x6F)
 
 
 _NARROW: Final = (
@@ -91,6 +85,12 @@ _NARROW: Final = (
     _S.FAULT,
 )
 """States coded without bit 5 (mask 0x4F); the others have mask 0x6F."""
+
+_BY_PATTERN: Final[dict[int, DriveState]] = {
+    **{state.value: state for state in DriveState},
+    **{state.value | 0x20: state for state in _NARROW},
+}
+"""States by bits 0-3, 5, 6 of the statusword."""
 
 
 def enabling_controlword(state: DriveState | None) -> int:

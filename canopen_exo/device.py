@@ -10,11 +10,20 @@ from mypy_extensions import mypyc_attr
 
 from canopen_exo.bus.frame import FLAG_EXTENDED, FLAG_FD, FLAG_REMOTE, Frame
 from canopen_exo.bus.node import MS, NEVER, Node, Out
-from canopen_exo.emcy import COMMUNICATION_BIT, HEARTBEAT_LOST, RPDO_TIMEOUT, SYNC_LENGTH, SYNC_LOST, EmcyProducer
+from canopen_exo.emcy import (
+    COMMUNICATION_BIT,
+    HEARTBEAT_LOST,
+    PDO_TOO_LONG,
+    PDO_TOO_SHORT,
+    RPDO_TIMEOUT,
+    SYNC_LENGTH,
+    SYNC_LOST,
+    EmcyProducer,
+)
 from canopen_exo.heartbeat import HeartbeatConsumer, HeartbeatProducer, heartbeat_frame
 from canopen_exo.nmt import NmtCommand, NmtSlave, NmtState, decode_nmt
 from canopen_exo.od import ObjectDictionary, WriteObserver
-from canopen_exo.pdo import INVALID, PDO_COUNT, ReceivePdo, TransmitPdo, key_of, mapping_abort
+from canopen_exo.pdo import INVALID, PDO_COUNT, ReceivePdo, TransmitPdo, is_restricted, key_of, mapping_abort
 from canopen_exo.plan import HEARTBEAT, SDO_ANSWER, SDO_REQUEST, SYNC
 from canopen_exo.sdo import SdoServer
 from canopen_exo.sync import SyncConsumer
@@ -51,9 +60,8 @@ class Application(WriteObserver):
     def communication_lost(self, now: int, code: int) -> None:
         """A communication error (EMCY code) that the device must react to; object 0x6007 says how."""
 
-    def can_clear(self, code: int) -> bool:
-        """Whether an error may be reported as gone now."""
-        return True
+    def errors_gone(self) -> None:
+        """The last error is gone (EMCY 0000)."""
 
 
 @final
@@ -76,6 +84,8 @@ class Device(Node):
         self.sdo: SdoServer = SdoServer(od, node_id)
         self.emcy: Final[EmcyProducer] = EmcyProducer(node_id)
         self.heartbeat: Final[HeartbeatProducer] = HeartbeatProducer(node_id)
+        self._all_tpdos: Final[list[TransmitPdo]] = [TransmitPdo(od, number) for number in range(PDO_COUNT)]
+        self._all_rpdos: Final[list[ReceivePdo]] = [ReceivePdo(od, number) for number in range(PDO_COUNT)]
         self.tpdos: list[TransmitPdo] = []
         self.rpdos: list[ReceivePdo] = []
         self.rpdo_by_id: dict[int, ReceivePdo] = {}
@@ -99,11 +109,11 @@ class Device(Node):
 
     def receive(self, now: int, port: int, frame: Frame, out: Out) -> None:
         """Any frame of the bus."""
-        if frame.flags & (FLAG_EXTENDED | FLAG_REMOTE | FLAG_FD):
+        if frame.flags and frame.flags & (FLAG_EXTENDED | FLAG_REMOTE | FLAG_FD):
             return
         can_id, data = frame.can_id, frame.data
         if can_id == SYNC:
-            self._sync(now, data, out)
+            self.synchronise(now, data, out)
             return
         rpdo = self.rpdo_by_id.get(can_id)
         if rpdo is not None:
@@ -120,24 +130,35 @@ class Device(Node):
         elif can_id == 0:
             self._command(now, data, out)
         elif can_id >= HEARTBEAT:
-            for consumer in self.consumers:
-                if consumer.node_id == can_id - HEARTBEAT and consumer.received(now, data):
-                    self._vanished(HEARTBEAT_LOST)
+            self._heartbeat(now, can_id - HEARTBEAT, data)
         self._send_emcy(now, out)
         self._plan_wake()
 
-    def _sync(self, now: int, data: bytes, out: Out) -> None:
-        """SYNC: apply what pends, latch, send the PDOs that are due."""
+    def _heartbeat(self, now: int, node_id: int, data: bytes) -> None:
+        """A heartbeat came; the error is gone when no producer is lost any more."""
+        lost = False
+        for consumer in self.consumers:
+            if consumer.node_id == node_id:
+                consumer.received(now, data)
+            lost = lost or consumer.lost
+        if not lost:
+            self.emcy.vanish(HEARTBEAT_LOST)
+
+    def synchronise(self, now: int, data: bytes, out: Out) -> None:
+        """SYNC came (as by `receive`): apply what pends, latch, send the PDOs that are due."""
         if not self.operational:
             return
         consumer = self.sync_consumer
-        if consumer.lost:
-            self._vanished(SYNC_LOST)
         if not consumer.received(now, data):
-            self.emcy.report(SYNC_LENGTH)
+            self.emcy.occur(SYNC_LENGTH, COMMUNICATION_BIT)
             self._send_emcy(now, out)
             self._plan_wake()
             return
+        if self.emcy.active:
+            self.emcy.vanish(SYNC_LENGTH)
+            self.emcy.vanish(SYNC_LOST)
+            self._send_emcy(now, out)
+            self._plan_wake()
         applied = False
         for rpdo in self.rpdos:
             if rpdo.pending is not None and rpdo.apply(self.od):
@@ -149,7 +170,7 @@ class Device(Node):
         counter = data[0] if data else 0
         values = self.od.values
         for tpdo in self.tpdos:
-            if tpdo.on_sync(counter):
+            if tpdo.always or tpdo.on_sync(counter):
                 out.send(self.port, tpdo.frame(values))
         if consumer.deadline < self.wake_at:
             self.wake_at = consumer.deadline
@@ -160,16 +181,29 @@ class Device(Node):
             return
         code = rpdo.received(now, data)
         if code:
-            self.emcy.report(code)
+            self.emcy.occur(code, COMMUNICATION_BIT)
+        if self.emcy.active:
+            self._rpdo_errors_gone()
             self._send_emcy(now, out)
-        if rpdo.late and rpdo.pending is not None:
-            rpdo.late = False
-            self._vanished(RPDO_TIMEOUT)
-            self._send_emcy(now, out)
+            self._plan_wake()
         if not rpdo.synchronous and rpdo.apply(self.od):
             self.application.applied(now)
         if rpdo.deadline < self.wake_at:
             self.wake_at = rpdo.deadline
+
+    def _rpdo_errors_gone(self) -> None:
+        """An error of RPDOs is gone when none of them has it any more."""
+        late, short, long = False, False, False
+        for rpdo in self.rpdos:
+            late = late or rpdo.late
+            short = short or rpdo.wrong == PDO_TOO_SHORT
+            long = long or rpdo.wrong == PDO_TOO_LONG
+        if not late:
+            self.emcy.vanish(RPDO_TIMEOUT)
+        if not short:
+            self.emcy.vanish(PDO_TOO_SHORT)
+        if not long:
+            self.emcy.vanish(PDO_TOO_LONG)
 
     # --- time ----------------------------------------------------------------------------------------------------
 
@@ -186,10 +220,10 @@ class Device(Node):
             if now >= consumer.deadline:
                 consumer.lose()
                 self._communication_error(now, HEARTBEAT_LOST, out)
-        if now >= self.sync_consumer.deadline and self.sync_consumer.wake(now):
+        if self.sync_consumer.wake(now):
             self._communication_error(now, SYNC_LOST, out)
         for rpdo in self.rpdos:
-            if now >= rpdo.deadline and rpdo.wake(now):
+            if rpdo.wake(now):
                 self._communication_error(now, RPDO_TIMEOUT, out)
         if now >= self.sdo.deadline:
             answer = self.sdo.expire(now)
@@ -200,7 +234,9 @@ class Device(Node):
         self._plan_wake()
 
     def _plan_wake(self) -> None:
-        at = min(self.boot_at, self.heartbeat.due, self.sync_consumer.deadline, self.sdo.deadline, self.emcy.due)
+        at = min(self.boot_at, self.heartbeat.due, self.sync_consumer.deadline, self.sdo.deadline)
+        if self.emcy.queue and self._may_send_emcy():
+            at = min(at, self.emcy.due)
         for consumer in self.consumers:
             if consumer.deadline < at:
                 at = consumer.deadline
@@ -223,12 +259,10 @@ class Device(Node):
         self._send_emcy(now, out)
         self._plan_wake()
 
-    def _vanished(self, code: int) -> None:
-        self.emcy.vanish(code)
-
     def _communication_error(self, now: int, code: int, out: Out) -> None:
         """EMCY, the reaction of 0x6007 (application) and of 0x1029:1 (NMT state)."""
         self.emcy.occur(code, COMMUNICATION_BIT)
+        self._send_emcy(now, out)  # before 1029 may stop the device
         self.application.communication_lost(now, code)
         behaviour = self.od.values[key_of(0x1029, 1)]
         if behaviour == 0 and self.operational:
@@ -236,8 +270,12 @@ class Device(Node):
         elif behaviour == 2:
             self._apply_command(now, NmtCommand.STOP, out)
 
+    def _may_send_emcy(self) -> bool:
+        """CiA 301, table 38: in Pre-operational and Operational; else messages wait."""
+        return self.nmt.state is not NmtState.INITIALISING and self.nmt.state is not NmtState.STOPPED
+
     def _send_emcy(self, now: int, out: Out) -> None:
-        if self.nmt.state is NmtState.INITIALISING or self.nmt.state is NmtState.STOPPED:
+        if not self._may_send_emcy():
             return
         while self.emcy.due <= now:
             frame = self.emcy.wake(now)
@@ -247,7 +285,10 @@ class Device(Node):
 
     def _publish_errors(self) -> None:
         """Objects 0x1001 and 0x1003 show what the EMCY producer knows."""
-        self.od.set(ERROR_REGISTER, self.emcy.register)
+        register = self.emcy.register
+        if register == 0 and self.od.values[ERROR_REGISTER]:
+            self.application.errors_gone()
+        self.od.set(ERROR_REGISTER, register)
         history = self.emcy.history
         self.od.set(key_of(0x1003, 0), len(history))
         for at in range(len(history)):
@@ -275,6 +316,8 @@ class Device(Node):
             self.application.left_operational(now)
         if self.nmt.state is NmtState.INITIALISING:
             self._reset(now, command)
+        elif self.nmt.state is NmtState.STOPPED:
+            self.sdo.stop()
         elif self.operational:
             for tpdo in self.tpdos:
                 tpdo.restart()
@@ -289,6 +332,7 @@ class Device(Node):
         self.emcy.active.clear()
         self.emcy.queue.clear()
         self.emcy.history.clear()
+        self.emcy.inhibit_ns = self.od.values[key_of(0x1015, 0)] * 100_000  # multiples of 100 us
         self.sdo = SdoServer(self.od, self.node_id)
         self.nmt = NmtSlave()
         self.heartbeat.start(now, 0)
@@ -304,12 +348,15 @@ class Device(Node):
         period_ns = self.od.values[key_of(0x1006, 0)] * 1000
         self.sync_consumer = SyncConsumer(self.od.values[key_of(0x1019, 0)], SYNC_LOSS_CYCLES * period_ns)
 
-    def configure_pdos(self) -> None:
-        """Read all PDO parameters anew; `tpdos` and `rpdos` are the active ones."""
-        tpdos = [TransmitPdo(self.od, number) for number in range(PDO_COUNT)]
-        rpdos = [ReceivePdo(self.od, number) for number in range(PDO_COUNT)]
-        self.tpdos = [tpdo for tpdo in tpdos if tpdo.active]
-        self.rpdos = [rpdo for rpdo in rpdos if rpdo.active]
+    def configure_pdos(self, index: int = 0) -> None:
+        """Read the PDO that has this object anew, all with 0; `tpdos` and `rpdos` are the active ones."""
+        for number in range(PDO_COUNT):
+            if index in (0, 0x1800 + number, 0x1A00 + number):
+                self._all_tpdos[number] = TransmitPdo(self.od, number)
+            if index in (0, 0x1400 + number, 0x1600 + number):
+                self._all_rpdos[number] = ReceivePdo(self.od, number)
+        self.tpdos = [tpdo for tpdo in self._all_tpdos if tpdo.active]
+        self.rpdos = [rpdo for rpdo in self._all_rpdos if rpdo.active]
         self.rpdo_by_id = {rpdo.cob_id: rpdo for rpdo in self.rpdos}
         self.revision += 1
 
@@ -318,7 +365,7 @@ class Device(Node):
         self.consumers = []
         for sub in range(1, self.od.values[key_of(0x1016, 0)] + 1):
             word = self.od.values[key_of(0x1016, sub)]
-            if word >> 16 & 0xFF and word & 0xFFFF:
+            if 1 <= word >> 16 & 0xFF <= 127 and word & 0xFFFF:
                 self.consumers.append(HeartbeatConsumer(word >> 16 & 0xFF, (word & 0xFFFF) * MS))
         self.revision += 1
 
@@ -340,7 +387,8 @@ class _Rules(WriteObserver):
             return ABORT_VALUE_RANGE
         if index == 0x1016 and sub and raw >> 16 & 0xFF and raw & 0xFFFF:
             for other in range(1, values[key_of(0x1016, 0)] + 1):
-                if other != sub and values[key_of(0x1016, other)] >> 16 & 0xFF == raw >> 16 & 0xFF:
+                word = values[key_of(0x1016, other)]
+                if other != sub and word & 0xFFFF and word >> 16 & 0xFF == raw >> 16 & 0xFF:
                     return ABORT_INCOMPATIBLE
         if 0x1400 <= index < 0x1400 + PDO_COUNT or 0x1800 <= index < 0x1800 + PDO_COUNT:
             return self._check_communication(index, sub, raw)
@@ -349,6 +397,8 @@ class _Rules(WriteObserver):
         return device.application.check(key, raw)
 
     def _check_communication(self, index: int, sub: int, raw: int) -> int:
+        if sub == 1 and not raw & INVALID and is_restricted(raw & 0x3FFFFFFF):
+            return ABORT_VALUE_RANGE
         if sub == 2 and index >= 0x1800 and not 1 <= raw <= 240:
             return ABORT_VALUE_RANGE  # transmit types other than synchronous cyclic are not there
         if sub == 2 and index < 0x1800 and 240 < raw < 254:
@@ -382,6 +432,6 @@ class _Rules(WriteObserver):
         elif index == 0x1016:
             device.configure_consumers()
         elif 0x1400 <= index < 0x1C00:
-            device.configure_pdos()
+            device.configure_pdos(index)
         else:
             device.application.written(key, raw)

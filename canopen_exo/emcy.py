@@ -46,9 +46,16 @@ def decode_emcy(node_id: int, data: bytes) -> Emergency | None:
     return Emergency(node_id, data[0] | data[1] << 8, data[2])
 
 
+QUEUE_LENGTH: Final = 16
+"""Messages that wait for the inhibit time; further ones are not sent, and counted."""
+
+
 @final
 class EmcyProducer:
-    """Active errors of one device. queue: messages not sent yet; due: when the next may go (inhibit time)."""
+    """Active errors of one device. queue: messages not sent yet; due: when the next may go (inhibit time).
+
+    active: code -> class bit; history: codes, the newest first, at most 8; dropped: messages that found the queue full.
+    """
 
     def __init__(self, node_id: int) -> None:
         self.node_id: Final[int] = node_id
@@ -56,6 +63,7 @@ class EmcyProducer:
         self.active: dict[int, int] = {}
         self.history: list[int] = []
         self.queue: list[Frame] = []
+        self.dropped: int = 0
         self.free_at: int = 0
 
     @property
@@ -76,14 +84,10 @@ class EmcyProducer:
         if code in self.active:
             return False
         self.active[code] = class_bit
-        self.report(code)
-        return True
-
-    def report(self, code: int) -> None:
-        """Queue a message for an occurrence that does not stay, and keep it in the history (newest first, 8)."""
         self.history.insert(0, code)
         del self.history[8:]
         self._queue(code)
+        return True
 
     def vanish(self, code: int) -> None:
         """An error is gone: the code 0000 tells when it was the last one."""
@@ -97,6 +101,9 @@ class EmcyProducer:
             self._queue(NO_ERROR)
 
     def _queue(self, code: int) -> None:
+        if len(self.queue) >= QUEUE_LENGTH:
+            self.dropped += 1
+            return
         self.queue.append(Frame(EMCY + self.node_id, struct.pack("<HB5x", code, self.register)))
 
     def wake(self, now: int) -> Frame | None:

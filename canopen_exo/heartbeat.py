@@ -53,6 +53,10 @@ class HeartbeatConsumer:
         self.lost: bool = False
         self.deadline: int = NEVER
 
+    def watch(self, now: int) -> None:
+        """Start monitoring before the first heartbeat."""
+        self.deadline = min(self.deadline, now + self.timeout_ns)
+
     def received(self, now: int, data: bytes) -> bool:
         """A heartbeat came; True when it ends a loss. Messages without a state byte are no heartbeats."""
         if len(data) != 1:

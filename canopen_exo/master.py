@@ -19,6 +19,9 @@ from canopen_exo.plan import EMCY, HEARTBEAT, MASTER_ID, SDO_ANSWER, SDO_REQUEST
 from canopen_exo.sdo import SdoClient, abort_text
 from canopen_exo.sync import SyncProducer
 
+POWER_UP_NS: Final = 20 * MS
+"""When the master starts: later than devices powered up with it, which hear no reset before their boot-up."""
+
 BOOT_TIMEOUT_NS: Final = 1000 * MS
 """How long a device may take to its boot-up message."""
 
@@ -67,6 +70,9 @@ class MasterState(Enum):
     STOPPED = "stopped"
 
 
+_OPERATIONAL: Final = MasterState.OPERATIONAL  # compared with for every PDO; an enumeration is looked up slowly
+
+
 @mypyc_attr(allow_interpreted_subclasses=True)
 class MasterApplication:
     """What a master does beyond communication.
@@ -92,6 +98,9 @@ class MasterApplication:
 
     def node_lost(self, now: int, slave: int, out: Out) -> None:
         """A device's heartbeat stopped."""
+
+    def left_operational(self, now: int, slave: int, state: int, out: Out) -> None:
+        """A device's heartbeat tells another NMT state (CiA 301: 4 stopped, 127 pre-operational) than Operational."""
 
     def rebooted(self, now: int, slave: int, out: Out) -> None:
         """A device sent its boot-up message while the master took it for started."""
@@ -220,30 +229,31 @@ class Master(Node):
         self.failure: str = ""
         self.boot_deadline: int = NEVER
         self.sync_at: int = NEVER
-        self.supervise_at: int = 0
-        self.wake_at = 0
+        self.supervise_at: int = POWER_UP_NS
+        self.wake_at = POWER_UP_NS
         self._by_node: Final[dict[int, int]] = {config.node_id: at for at, config in enumerate(slaves)}
-        self._pdo_slave: Final[dict[int, int]] = {}
-        self._pdo_number: Final[dict[int, int]] = {}
+        self._pdo_source: Final[dict[int, tuple[int, int]]] = {}  # slave and PDO number by id
         for pdo in plan.pdos:
             if pdo.name.startswith("TPDO"):
                 for at, config in enumerate(slaves):
-                    self._pdo_slave[pdo.base + config.node_id] = at
-                    self._pdo_number[pdo.base + config.node_id] = int(pdo.name[4:])
+                    self._pdo_source[pdo.base + config.node_id] = (at, int(pdo.name[4:]))
 
     def receive(self, now: int, port: int, frame: Frame, out: Out) -> None:
         """Any frame of the bus."""
-        if frame.flags & (FLAG_EXTENDED | FLAG_REMOTE | FLAG_FD):
+        if frame.flags and frame.flags & (FLAG_EXTENDED | FLAG_REMOTE | FLAG_FD):
             return
         can_id = frame.can_id
-        slave = self._pdo_slave.get(can_id, -1)
-        if slave >= 0:
-            if self.state is MasterState.OPERATIONAL:
-                self.application.process_data(now, slave, self._pdo_number[can_id], frame.data, out)
-                self._plan_wake()
+        source = self._pdo_source.get(can_id)
+        if source is not None:
+            if self.state is _OPERATIONAL:
+                application = self.application
+                before = application.wake_at
+                application.process_data(now, source[0], source[1], frame.data, out)
+                if application.wake_at != before:
+                    self._plan_wake()
             return
         at = self._by_node.get(can_id & 0x7F, -1)
-        if at < 0:
+        if at < 0 or self.state is MasterState.RESETTING:  # nothing is planned before the first wake-up
             return
         function = can_id & 0x780
         if function == SDO_ANSWER:
@@ -261,14 +271,14 @@ class Master(Node):
     def wake(self, now: int, out: Out) -> None:
         """Serve every timer that is due; SYNC first."""
         application = self.application
+        if application.finished and self.state is _OPERATIONAL:
+            self._stop(out)
         if now >= self.sync_at:
             out.send(0, self.sync.next())
             self.sync_at += self.plan.cycle_ns
             application.synchronised(now, out)
         if now >= application.wake_at:
             application.wake(now, out)
-        if application.finished and self.state is MasterState.OPERATIONAL:
-            self._stop(out)
         if now >= self.supervise_at:
             self._supervise(now, out)
         self._plan_wake()
@@ -280,13 +290,11 @@ class Master(Node):
         if now >= self.heartbeat.due:
             out.send(0, self.heartbeat.beat(now, NmtState.OPERATIONAL))
         if self.state is not MasterState.FAILED:
-            at = 0
-            for slave in self.slaves:
+            for at, slave in enumerate(self.slaves):
                 self._send(at, slave.wake(now, self.boot_deadline), out)
                 if now >= slave.consumer.deadline:
                     slave.consumer.lose()
                     self.application.node_lost(now, at, out)
-                at += 1
             self._advance(now, out)
         self._plan_supervision()
 
@@ -311,7 +319,12 @@ class Master(Node):
             elif self.state is MasterState.OPERATIONAL:
                 self.application.rebooted(now, at, out)
             return
+        before = slave.consumer.state
         slave.consumer.received(now, data)
+        state = slave.consumer.state
+        started = self.state is _OPERATIONAL and before == NmtState.OPERATIONAL.value
+        if started and state != NmtState.OPERATIONAL.value:
+            self.application.left_operational(now, at, state, out)
 
     def _send(self, at: int, request: bytes | None, out: Out) -> None:
         if request is not None:
@@ -332,6 +345,8 @@ class Master(Node):
         if ready:
             self.state = MasterState.OPERATIONAL
             out.send(0, nmt_frame(NmtCommand.START, ALL_NODES))
+            for slave in self.slaves:
+                slave.consumer.watch(now)
             cycle = self.plan.cycle_ns
             self.sync_at = (now // cycle + 2) * cycle  # every device has had the start command by then
             self.application.operational(now, out)

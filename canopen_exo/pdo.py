@@ -13,7 +13,7 @@ from canopen_exo.bus.frame import Frame
 from canopen_exo.bus.node import MS, NEVER
 from canopen_exo.emcy import PDO_TOO_LONG, PDO_TOO_SHORT
 from canopen_exo.errors import CanopenExoError
-from canopen_exo.od import ObjectDictionary
+from canopen_exo.od import Entry, ObjectDictionary
 from canopen_exo.signal import Codec, compile_codec
 
 PDO_COUNT: Final = 4
@@ -29,6 +29,15 @@ ABORT_PDO_LENGTH: Final = 0x06040042
 def key_of(index: int, sub: int) -> int:
     """The object dictionary's key of index and sub-index."""
     return index << 8 | sub
+
+
+_RESTRICTED: Final = ((0x000, 0x07F), (0x101, 0x180), (0x581, 0x5FF), (0x601, 0x67F), (0x6E0, 0x6FF), (0x701, 1 << 30))
+"""CiA 301, 7.3.5, restricted CAN-IDs; above 0x7FF are 29-bit ids and bit 29, which this device does not support."""
+
+
+def is_restricted(cob_id: int) -> bool:
+    """Whether a PDO may not have this COB-ID (bits 0-29)."""
+    return any(low <= cob_id <= high for low, high in _RESTRICTED)
 
 
 def mapping_abort(od: ObjectDictionary, map_index: int, count: int) -> int:
@@ -69,11 +78,18 @@ def _reader(keys: list[int]) -> Callable[[dict[int, int]], Sequence[int]]:
     return lambda values: [values[key] for key in keys]
 
 
+def _is_limited(entry: Entry) -> bool:
+    """Whether the object's limits are narrower than what its bits can hold."""
+    low = -(1 << (entry.bits - 1)) if entry.signed else 0
+    return entry.low > low or entry.high < low + (1 << entry.bits) - 1
+
+
 @final
 class TransmitPdo:
     """A TPDO. active: exists and has a synchronous type; cob_id: its id; every: sent on each n-th SYNC.
 
     start: SYNC start value (18xx:6); 0 counts from the first SYNC, else from the SYNC that carries this counter.
+    always: sent on every SYNC, `on_sync` need not be asked.
     """
 
     def __init__(self, od: ObjectDictionary, number: int) -> None:
@@ -85,8 +101,10 @@ class TransmitPdo:
         self.keys: Final[list[int]] = keys
         self.codec: Final[Codec] = codec
         self._read: Final[Callable[[dict[int, int]], Sequence[int]]] = _reader(keys)
+        self._encode: Final[Callable[..., bytes]] = codec.encode
         self.active: Final[bool] = not cob & INVALID and 1 <= self.every <= 240 and len(keys) > 0
         self.start: Final[int] = od.values[key_of(comm, 6)]
+        self.always: Final[bool] = self.every == 1 and self.start == 0
         self.countdown: int = 0 if self.start else self.every
 
     def restart(self) -> None:
@@ -99,7 +117,8 @@ class TransmitPdo:
             if counter != self.start and counter != 0:
                 return False
             self.countdown = self.every
-            return True
+            if counter:
+                return True
         self.countdown -= 1
         if self.countdown:
             return False
@@ -108,13 +127,14 @@ class TransmitPdo:
 
     def frame(self, values: dict[int, int]) -> Frame:
         """The PDO with the present values of its objects."""
-        return Frame(self.cob_id, self.codec.pack(self._read(values)))
+        return Frame(self.cob_id, self._encode(*self._read(values)))
 
 
 @final
 class ReceivePdo:
     """An RPDO. pending: payload waiting for SYNC (synchronous types); last: time of the last reception.
 
+    late, wrong: its silence (8250) or the length of its last payload (8210, 8220) is an error now.
     deadline: when its silence must be looked at (14xx:5, lazy as in the SYNC consumer), NEVER before the first.
     """
 
@@ -126,8 +146,11 @@ class ReceivePdo:
         keys, codec = _mapping(od, map_index)
         self.keys: Final[list[int]] = keys
         self.codec: Final[Codec] = codec
+        self._size: Final[int] = codec.size
+        self._unpack: Final[Callable[[bytes], tuple[int, ...]]] = codec.unpack
         self._low: Final[list[int]] = [od.entries[key].low for key in keys]
         self._high: Final[list[int]] = [od.entries[key].high for key in keys]
+        self._limited: Final[bool] = any(_is_limited(od.entries[key]) for key in keys)
         self.active: Final[bool] = not cob & INVALID and len(keys) > 0
         self.synchronous: Final[bool] = kind <= 240
         self.timeout_ns: Final[int] = od.values[key_of(comm, 5)] * MS
@@ -135,17 +158,21 @@ class ReceivePdo:
         self.last: int = NEVER
         self.deadline: int = NEVER
         self.late: bool = False
+        self.wrong: int = 0
 
     def received(self, now: int, data: bytes) -> int:
         """Take a payload; the EMCY code of a wrong length (too long is served, too short is not), else 0."""
         size = len(data)
-        if size < self.codec.size:
+        if size < self._size:
+            self.wrong = PDO_TOO_SHORT
             return PDO_TOO_SHORT
+        self.wrong = PDO_TOO_LONG if size > self._size else 0
+        self.late = False
         self.pending = data
         self.last = now
         if self.deadline == NEVER and self.timeout_ns:
             self.deadline = now + self.timeout_ns
-        return PDO_TOO_LONG if size > self.codec.size else 0
+        return self.wrong
 
     def apply(self, od: ObjectDictionary) -> bool:
         """Move the pending payload into the object dictionary; False when there is none.
@@ -156,13 +183,12 @@ class ReceivePdo:
         if data is None:
             return False
         self.pending = None
-        raw = self.codec.unpack(data)
+        raw = self._unpack(data)
         values = od.values
-        at = 0
-        for key in self.keys:
-            if self._low[at] <= raw[at] <= self._high[at]:
+        limited = self._limited
+        for at, key in enumerate(self.keys):
+            if not limited or self._low[at] <= raw[at] <= self._high[at]:
                 values[key] = raw[at]
-            at += 1
         return True
 
     def stop(self) -> None:
@@ -170,13 +196,14 @@ class ReceivePdo:
         self.pending = None
         self.deadline = NEVER
         self.late = False
+        self.wrong = 0
 
     def wake(self, now: int) -> bool:
-        """True once, when the PDO has been silent for its deadline (EMCY 8250)."""
-        if now < self.deadline:
+        """True once, when the PDO has been silent for its deadline (EMCY 8250). Looking early moves the deadline on."""
+        if self.deadline == NEVER:
             return False
-        if now < self.last + self.timeout_ns:
-            self.deadline = self.last + self.timeout_ns
+        self.deadline = self.last + self.timeout_ns
+        if now < self.deadline:
             return False
         self.deadline = NEVER
         self.late = True

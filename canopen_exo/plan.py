@@ -114,6 +114,9 @@ class BusPlan:
                 f"bus plan: bit rate {self.bitrate} given; allowed are rates whose bit time is a whole number of "
                 "nanoseconds, such as 1000000, 800000, 500000, 250000, 125000"
             )
+        for what, period in (("SYNC", self.cycle_ns), ("heartbeat", self.heartbeat_ns)):
+            if period <= 0:
+                raise CanopenExoError(f"bus plan: {what} period of {period} ns given, allowed is more than 0")
         if self.sync_counter == 1 or not 0 <= self.sync_counter <= 240:
             raise CanopenExoError(f"bus plan: SYNC counter {self.sync_counter} given, allowed 0 or 2..240 (CiA 301)")
         ids = [joint.node_id for joint in self.joints]
@@ -164,7 +167,7 @@ class BusPlan:
     def scale(self, joint: JointNode, unit: str) -> float:
         """SI value of one raw unit of an object of that SI unit: counts, counts/s, per mille of rated torque."""
         if unit == "N m":
-            return joint.rated_torque_mnm * 1e-6  # 0x6071 and 0x6077 count per mille of 0x6076 (CiA 402-2)
+            return joint.rated_torque_mnm / 1_000_000  # 0x6071 and 0x6077 count per mille of 0x6076 (CiA 402-2)
         if unit in ("rad", "rad/s"):
             return 2 * math.pi / joint.encoder_counts
         return 1.0

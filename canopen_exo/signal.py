@@ -6,11 +6,9 @@ SI floats become raw integers only here, once at each end. Raw values that do no
 
 import math
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final, final
-
-from mypy_extensions import mypyc_attr
 
 from canopen_exo.errors import CanopenExoError
 
@@ -82,19 +80,22 @@ def write_bits(data: bytes, start: int, length: int, raw: int) -> bytes:
     return word.to_bytes(len(data), "little")
 
 
-@mypyc_attr(allow_interpreted_subclasses=True)
 class Codec:
-    """Packs and unpacks all values of one mapping, in mapping order. `size`: bytes of the payload."""
+    """Packs and unpacks all values of one mapping, in mapping order. `size`: bytes of the payload.
 
-    size: int
+    encode: the payload of raw values, one argument each; each must fit (the object dictionary clips on writing).
+    unpack: the raw values of a payload of at least `size` bytes; further bytes are ignored.
+    Both are functions kept as values: so those of `struct` are called directly, without a method of ours in between.
+    """
+
+    def __init__(self, size: int, encode: Callable[..., bytes], unpack: Callable[[bytes], tuple[int, ...]]) -> None:
+        self.size: Final[int] = size
+        self.encode: Final[Callable[..., bytes]] = encode
+        self.unpack: Final[Callable[[bytes], tuple[int, ...]]] = unpack
 
     def pack(self, values: Sequence[int]) -> bytes:
-        """Payload of raw values; each must fit (the object dictionary clips on writing)."""
-        raise NotImplementedError
-
-    def unpack(self, data: bytes) -> tuple[int, ...]:
-        """Raw values of a payload of at least `size` bytes; further bytes are ignored."""
-        raise NotImplementedError
+        """Payload of raw values."""
+        return self.encode(*values)
 
 
 @final
@@ -102,15 +103,7 @@ class _StructCodec(Codec):
     """Byte-aligned objects of 8, 16, 32 or 64 bits: one compiled struct."""
 
     def __init__(self, layout: struct.Struct) -> None:
-        self.size = layout.size
-        self._pack: Final = layout.pack
-        self._unpack_from: Final = layout.unpack_from
-
-    def pack(self, values: Sequence[int]) -> bytes:
-        return self._pack(*values)
-
-    def unpack(self, data: bytes) -> tuple[int, ...]:
-        return self._unpack_from(data)
+        super().__init__(layout.size, layout.pack, layout.unpack_from)
 
 
 @final
@@ -118,17 +111,17 @@ class _BitCodec(Codec):
     """Any other mapping: shifts."""
 
     def __init__(self, fields: list[tuple[int, bool]]) -> None:
-        self.size = (sum(length for length, _ in fields) + 7) // 8
+        super().__init__((sum(length for length, _ in fields) + 7) // 8, self._encode, self._unpack)
         self._fields: Final = fields
 
-    def pack(self, values: Sequence[int]) -> bytes:
+    def _encode(self, *values: int) -> bytes:
         word, at = 0, 0
         for (length, _), value in zip(self._fields, values, strict=True):
             word |= (value & ((1 << length) - 1)) << at
             at += length
         return word.to_bytes(self.size, "little")
 
-    def unpack(self, data: bytes) -> tuple[int, ...]:
+    def _unpack(self, data: bytes) -> tuple[int, ...]:
         values, at = [], 0
         for length, signed in self._fields:
             values.append(read_bits(data, at, length, signed))

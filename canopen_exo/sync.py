@@ -14,18 +14,23 @@ from canopen_exo.plan import SYNC
 
 @final
 class SyncProducer:
-    """Makes the SYNC frames. counter: the last one sent, 0 before the first; overflow 0: SYNC without data."""
+    """Makes the SYNC frames. counter: the last one sent, 0 before the first; overflow 0: SYNC without data.
+
+    There are only so many different ones: each is made, and measured, once.
+    """
 
     def __init__(self, overflow: int) -> None:
         self.overflow: Final[int] = overflow
         self.counter: int = 0
+        self._frames: Final[list[Frame]] = [Frame(SYNC, b"")]
+        for counter in range(1, overflow + 1):
+            self._frames.append(Frame(SYNC, bytes((counter,))))
 
     def next(self) -> Frame:
         """The next SYNC frame."""
-        if self.overflow == 0:
-            return Frame(SYNC, b"")
-        self.counter = self.counter % self.overflow + 1
-        return Frame(SYNC, bytes((self.counter,)))
+        if self.overflow:
+            self.counter = self.counter % self.overflow + 1
+        return self._frames[self.counter]
 
 
 @final
@@ -39,13 +44,14 @@ class SyncConsumer:
     def __init__(self, overflow: int, timeout_ns: int) -> None:
         self.overflow: Final[int] = overflow
         self.timeout_ns: Final[int] = timeout_ns
+        self._size: Final[int] = 1 if overflow else 0
         self.last: int = NEVER
         self.deadline: int = NEVER
         self.lost: bool = False
 
     def received(self, now: int, data: bytes) -> bool:
         """Take a SYNC; False when its length does not fit 0x1019 (EMCY 8240), and it is not served."""
-        if len(data) != (1 if self.overflow else 0):
+        if len(data) != self._size:
             return False
         self.last = now
         if self.deadline == NEVER and self.timeout_ns:
@@ -59,11 +65,11 @@ class SyncConsumer:
         self.lost = False
 
     def wake(self, now: int) -> bool:
-        """True once, when SYNC has been silent for the time-out."""
-        if now < self.deadline:
+        """True once, when SYNC has been silent for the time-out. Looking early moves the deadline on."""
+        if self.deadline == NEVER:
             return False
-        if now < self.last + self.timeout_ns:
-            self.deadline = self.last + self.timeout_ns
+        self.deadline = self.last + self.timeout_ns
+        if now < self.deadline:
             return False
         self.deadline = NEVER
         self.lost = True

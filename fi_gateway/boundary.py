@@ -94,7 +94,9 @@ _TEXT: Final = WithJsonSchema({"type": "string", "examples": ["0.3 s", "-60 deg"
 Time: TypeAlias = Annotated[int, BeforeValidator(_duration), PlainSerializer(format_duration), _TEXT]
 Span: TypeAlias = Annotated[int, BeforeValidator(_span), PlainSerializer(format_duration), _TEXT]
 Angle: TypeAlias = Annotated[float, BeforeValidator(_angle), PlainSerializer(_show_angle), _TEXT]
-Share: TypeAlias = Annotated[float, BeforeValidator(parse_share)]
+Share: TypeAlias = Annotated[
+    float, BeforeValidator(parse_share), WithJsonSchema({"type": ["number", "string"], "examples": [0.2, "20 %"]})
+]
 Whole: TypeAlias = Annotated[int, Strict()]
 Count: TypeAlias = Annotated[int, Strict(), Field(ge=1)]
 Flag: TypeAlias = Annotated[bool, Strict()]

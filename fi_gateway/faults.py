@@ -24,12 +24,14 @@ class Fault:
     """What happens to the frames of an active injector.
 
     signal: what it acts on, None for the whole payload or frame; saturated: frames of the current or last activation
-    whose value was cut at the signal's range. Values here are made for one injector and not shared.
+    whose value was cut at the signal's range; spares: whether `apply` giving the frame itself means it was left alone.
+    Values here are made for one injector and not shared.
     """
 
     def __init__(self, signal: Signal | None = None) -> None:
         self.signal: Signal | None = signal
         self.saturated: int = 0
+        self.spares: bool = False
 
     def begin(self, now: int, held: dict[int, Frame], rng: Generator) -> bool:
         """The injector activates at `now` [ns]; False: cannot act yet, ask again at the next frame.
@@ -203,6 +205,7 @@ class Drop(Fault):
         super().__init__(None)
         if not 0.0 <= probability <= 1.0:
             raise FaultError(f"drop: probability {probability} given, allowed 0..1")
+        self.spares = True
         self._probability: Final[float] = probability
         self._rng: Generator | None = None
 

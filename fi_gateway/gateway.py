@@ -9,6 +9,7 @@ time 0 = arrival of the latest SYNC (0x080) on that port - cycle * cycle_ns; one
 latest SYNC is passed over, since a SYNC was missed. Later status frames do not move time 0. (cycle is 16 bits: joining
 a motion more than 65535 cycles old puts time 0 a multiple of 65536 cycles late.)
 Before time 0 injectors are inert, except those that count from power-up: the first classical data frame on either port.
+When the controller says that the motion is over (state STOPPED), they are inert again and open windows end.
 Events that were due before time 0 was known open their windows with their true times; frames already gone stay as they
 were.
 
@@ -20,7 +21,7 @@ from typing import Final, final
 
 from canopen_exo.bus.frame import Frame
 from canopen_exo.bus.node import NEVER, Node, Out
-from canopen_exo.plan import HLC_STATUS, STATUS_MOTION, SYNC
+from canopen_exo.plan import HLC_STATUS, STATUS_MOTION, STATUS_STOPPED, SYNC
 from fi_gateway.errors import FaultError
 from fi_gateway.injector import ACTIVE, ARMED, WAITING, Activation, Injector, graph_order
 
@@ -159,7 +160,7 @@ class Gateway(Node):
         """The frame after the injectors of its route; None: lost."""
         if self._power_up == NEVER:
             self._power_on(now)
-        if route.kind != _PLAIN and self.time_zero == NEVER:
+        if route.kind == _STATUS or (route.kind == _SYNC and self.time_zero == NEVER):
             self._observe(now, route.kind, frame)
         if now >= self.wake_at:
             self._advance(now)
@@ -180,11 +181,18 @@ class Gateway(Node):
         return frame
 
     def _observe(self, now: int, kind: int, frame: Frame) -> None:
-        """Look for time 0 in SYNC and status frames from the controller."""
+        """Look for time 0 in SYNC and status frames from the controller, then for the end of the motion."""
         if kind == _SYNC:
             self._last_sync = now
         elif len(frame.data) < 3:
             self.malformed += 1
+        elif self.time_zero != NEVER:
+            if frame.data[0] == STATUS_STOPPED:
+                self._advance(now - 1)
+                for injector in self.injectors:
+                    if not injector.from_power_up:
+                        injector.stop(now)
+                self._schedule()
         elif frame.data[0] == STATUS_MOTION and now - self._last_sync < self._cycle_ns:
             cycle = frame.data[1] | frame.data[2] << 8
             self.time_zero = self._last_sync - cycle * self._cycle_ns

@@ -41,6 +41,7 @@ _ACTIVATION_STATE: Final = (
     "end_ns",
     "frames_seen",
     "frames_unfit",
+    "frames_injected",
     "frames_changed",
     "saturated",
     "first_before",
@@ -65,9 +66,12 @@ _INJECTOR_STATE: Final = (
 
 @final
 class Target:
-    """Which frames an injector sees: classical 11-bit data frames of these COB-IDs, in these directions."""
+    """Which frames an injector sees: classical 11-bit data frames of these COB-IDs, in these directions.
 
-    def __init__(self, to_controller: bool, to_drives: bool, cob_ids: tuple[int, ...]) -> None:
+    name: what records call them, such as "right_knee.TPDO1"; a signal has its own name.
+    """
+
+    def __init__(self, to_controller: bool, to_drives: bool, cob_ids: tuple[int, ...], name: str = "") -> None:
         if not (to_controller or to_drives):
             raise FaultError("target: no direction given, allowed: to_controller, to_drives or both")
         if not cob_ids or min(cob_ids) < 0 or max(cob_ids) > 0x7FF:
@@ -75,9 +79,10 @@ class Target:
         self.to_controller: Final[bool] = to_controller
         self.to_drives: Final[bool] = to_drives
         self.cob_ids: Final[tuple[int, ...]] = cob_ids
+        self.name: Final[str] = name
 
-    def __reduce__(self) -> tuple[type["Target"], tuple[bool, bool, tuple[int, ...]]]:
-        return Target, (self.to_controller, self.to_drives, self.cob_ids)
+    def __reduce__(self) -> tuple[type["Target"], tuple[bool, bool, tuple[int, ...], str]]:
+        return Target, (self.to_controller, self.to_drives, self.cob_ids, self.name)
 
 
 @final
@@ -100,13 +105,13 @@ class Trigger:
 class Activation:
     """One activation. Times in ns on the loop's clock.
 
-    injector, index: name, and number of the activation from 0; signal: "node.name", "" for whole frames;
+    injector, index: name, and number of the activation from 0; signal: "node.name", for whole frames the target's name;
     cause: "event" or "trigger:<name>"; due_ns: the time drawn, given or triggered; start_ns: when the window opened,
     later than due_ns only when the fault had to wait for a value; duration_ns: as drawn or given, NEVER for no limit;
-    end_ns: first instant outside the window, as planned until it closes.
-    frames_seen: target frames that reached it; frames_unfit: of those, too short to act on; frames_changed: changed
-    or lost; saturated: values cut at the signal's range; first_before, first_after: the first changed frame
-    (first_after None: it was lost).
+    end_ns: first instant outside the window, as planned until it closes; a window without limit keeps NEVER.
+    frames_seen: target frames that reached it; frames_unfit: of those, too short to act on; frames_injected: acted on
+    (a drop that spares a frame does not act on it); frames_changed: of those, changed or lost; saturated: values cut at
+    the signal's range; first_before, first_after: the first changed frame (first_after None: it was lost).
     """
 
     def __init__(
@@ -122,6 +127,7 @@ class Activation:
         self.end_ns: int = min(start_ns + duration_ns, NEVER)
         self.frames_seen: int = 0
         self.frames_unfit: int = 0
+        self.frames_injected: int = 0
         self.frames_changed: int = 0
         self.saturated: int = 0
         self.first_before: Frame | None = None
@@ -180,7 +186,7 @@ class Injector:
         self.injected: int = 0
         self.manifested: int = 0
         self.too_short: int = 0
-        self._signal: Final[str] = "" if signal is None else f"{signal.node}.{signal.name}"
+        self._signal: Final[str] = target.name if signal is None else f"{signal.node}.{signal.name}"
         self._fault: Final[Fault] = fault
         self._event: Final[Event] = event
         self._effect: Final[Effect] = effect
@@ -223,7 +229,9 @@ class Injector:
             self.too_short += 1
             return frame
         result = self._fault.apply(now, frame)
-        self.injected += 1
+        if not (result is frame and self._fault.spares):
+            self.injected += 1
+            current.frames_injected += 1
         if result is not frame and result != frame:
             self.manifested += 1
             if current.frames_changed == 0:
@@ -250,8 +258,11 @@ class Injector:
             self.phase, self.next_ns = SPENT, NEVER
 
     def stop(self, now: int) -> None:
-        """No more injection; an open window ends at `now`."""
+        """No more injection; an open window ends at `now`, one without limit keeps its end NEVER."""
+        current = self._current
         self.close(now)
+        if current is not None and current.duration_ns >= NEVER and self._effect.frames == 0:
+            current.end_ns = NEVER
         self.phase, self.next_ns = SPENT, NEVER
 
     def __reduce__(self) -> tuple[type["Injector"], tuple[object, ...], dict[str, object]]:

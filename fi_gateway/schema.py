@@ -198,7 +198,7 @@ def _build(name: str, spec: InjectorSpec, plan: BusPlan, rng: Generator) -> Inje
     place = resolve(spec.target, plan)
     return Injector(
         name,
-        Target(place.to_controller, place.to_drives, place.cob_ids),
+        Target(place.to_controller, place.to_drives, place.cob_ids, place.name),
         spec.fault.build(place),
         spec.event.build(plan, rng),
         spec.effect.build(),

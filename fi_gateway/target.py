@@ -80,7 +80,8 @@ class TargetSpec(SpecModel):
 class Place:
     """A target on the bus. signal: None for whole frames; size: payload bytes, -1 when the plan does not know.
 
-    words: for people, such as "position of right_knee (0x185, to_controller)"; known: whether the plan has such frames.
+    words: for people, such as "position of right_knee (0x185, to_controller)"; name: for records, such as
+    "right_knee.TPDO1"; known: whether the plan has such frames.
     """
 
     to_controller: bool
@@ -89,6 +90,7 @@ class Place:
     signal: Signal | None
     size: int
     words: str
+    name: str
     known: bool = True
 
 
@@ -205,6 +207,7 @@ def _place(
         raise SpecError(("bus",), f"{what} does not travel {target.bus}; write bus: {direction}")
     ids = f"0x{cob_ids[0]:03X}" if len(cob_ids) == 1 else f"0x{cob_ids[0]:03X}..0x{cob_ids[-1]:03X}"
     way = "both ways" if target.bus == "both" else target.bus
+    thing, _, owner = what.partition(" of ")
     return Place(
         target.bus != TO_DRIVES,
         target.bus != TO_CONTROLLER,
@@ -212,5 +215,6 @@ def _place(
         signal,
         size,
         f"{what} ({ids}, {way})",
+        f"{owner}.{thing}" if owner and owner != "every joint" else f"{thing} {ids}",
         direction != "",
     )

@@ -148,17 +148,14 @@ class Controller:
         state, params = self.state, self.params
         q_d, dq_d, ddq_d = state.q_d, state.dq_d, state.ddq_d
         kp, kd = params.kp, params.kd
-        qdd = [0.0] * self.n_joints
+        qdd: list[float] = []
         for j in range(self.n_joints):
-            qdd[j] = ddq_d[j] + kd * (dq_d[j] - dq[j]) + kp * (q_d[j] - q[j])
+            qdd.append(ddq_d[j] + kd * (dq_d[j] - dq[j]) + kp * (q_d[j] - q[j]))
         command = self.dynamics.inverse(q, dq, qdd)
-        tau = list(command)
-        for j in range(self.n_joints):
-            limit = params.torque_limit_nm[j]
-            if tau[j] > limit:
-                tau[j] = limit
-            elif tau[j] < -limit:
-                tau[j] = -limit
+        tau: list[float] = []
+        for j, limit in enumerate(params.torque_limit_nm):
+            wanted = command[j]
+            tau.append(limit if wanted > limit else -limit if wanted < -limit else wanted)
         state.cycle = cycle
         state.tau_command = command
         state.tau = tau

@@ -6,16 +6,17 @@ Time 0 is the SYNC at which the fade-in of the gait is complete; the HLC status 
 A drive that leaves Operation enabled, or whose heartbeat stops, ends the motion: all drives are disabled.
 """
 
-import math
 import struct
+from collections.abc import Callable
 from enum import Enum
+from math import floor
 from typing import Final, final
 
 from canopen_exo import plan as ids
 from canopen_exo.bus.frame import Frame
 from canopen_exo.bus.node import MS, NEVER, Out
 from canopen_exo.cia402 import DriveState, decode_statusword, enabling_controlword
-from canopen_exo.emcy import NO_ERROR, Emergency
+from canopen_exo.emcy import HEARTBEAT_LOST, NO_ERROR, RPDO_TIMEOUT, SYNC_LOST, Emergency
 from canopen_exo.master import MasterApplication
 from canopen_exo.plan import BusPlan
 from canopen_exo.signal import Codec
@@ -26,6 +27,9 @@ ENABLE_TIMEOUT_NS: Final = 2000 * MS
 
 DISABLE_TIMEOUT_NS: Final = 200 * MS
 """How long the drives may take to report that they are disabled."""
+
+STOPPING_ERRORS: Final = (HEARTBEAT_LOST, RPDO_TIMEOUT, SYNC_LOST)
+"""EMCY codes with which a drive drops its torque (its 0x6007 = 2). The statusword says so too, but needs SYNC."""
 
 DEADLINE_SHARE: Final = 0.6
 """Torques are computed at the latest this share of the cycle after SYNC."""
@@ -47,6 +51,17 @@ class Phase(Enum):
     FAILED = "failed"
 
 
+# an enumeration is looked up slowly: what every cycle compares with has a name of its own
+_WAITING: Final = Phase.WAITING
+_ENABLING: Final = Phase.ENABLING
+_STARTING: Final = Phase.STARTING
+_MOTION: Final = Phase.MOTION
+_STOPPING: Final = Phase.STOPPING
+_STOPPED: Final = Phase.STOPPED
+_FAILED: Final = Phase.FAILED
+_OPERATION_ENABLED: Final = DriveState.OPERATION_ENABLED
+
+
 @final
 class Event:
     """Something the controller noticed. time_ns: loop clock; joint: name, "" for all; kind: one of the texts below."""
@@ -62,7 +77,7 @@ class Event:
 
 @final
 class Sample:
-    """What was wanted in one cycle of the motion: lists of n_joints; q_d rad, dq_d rad/s, tau_command N m (no clamp)."""
+    """What was wanted in a cycle of the motion: lists of n_joints; q_d rad, dq_d rad/s, tau_command N m (no clamp)."""
 
     __slots__ = ("cycle", "dq_d", "q_d", "tau_command")
 
@@ -75,7 +90,7 @@ class Sample:
 
 @final
 class HighLevelController(MasterApplication):
-    """Walks for a number of cycles. phase: what it is doing; time_zero: loop time of time 0 [ns], NEVER before it is known.
+    """Walks for a number of cycles. phase: what it is doing; time_zero: loop time of time 0 [ns], NEVER until known.
 
     events: what it noticed; samples: one per cycle of the motion; late: per joint, cycles of the motion whose values
     did not come before the deadline; completed: True when the whole motion was walked.
@@ -87,7 +102,7 @@ class HighLevelController(MasterApplication):
         self.plan: Final[BusPlan] = plan
         self.controller: Final[Controller] = controller
         self.motion_cycles: Final[int] = motion_cycles
-        self.phase: Phase = Phase.WAITING
+        self.phase: Phase = _WAITING
         self.time_zero: int = NEVER
         self.completed: bool = False
         self.events: list[Event] = []
@@ -99,20 +114,22 @@ class HighLevelController(MasterApplication):
         self._torque: Final[list[float]] = [plan.scale(joint, "N m") for joint in plan.joints]
         self._rpdo: Final[list[int]] = [ids.RPDO1 + joint.node_id for joint in plan.joints]
         tpdo1, tpdo2, rpdo1 = plan.pdo("TPDO1"), plan.pdo("TPDO2"), plan.pdo("RPDO1")
-        self._samples_codec: Final[Codec] = tpdo1.codec()
+        samples = tpdo1.codec()
+        self._samples_size: Final[int] = samples.size
+        self._unpack_samples: Final[Callable[[bytes], tuple[int, ...]]] = samples.unpack
         self._position_at: Final[int] = tpdo1.place("position")
         self._velocity_at: Final[int] = tpdo1.place("velocity")
         self._status_codec: Final[Codec] = tpdo2.codec()
         self._statusword_at: Final[int] = tpdo2.place("statusword")
-        self._command_codec: Final[Codec] = rpdo1.codec()
+        self._encode_command: Final[Callable[..., bytes]] = rpdo1.codec().encode
         self._controlword_at: Final[int] = rpdo1.place("controlword")
         self._torque_at: Final[int] = rpdo1.place("target_torque")
         self._command: Final[list[int]] = [0] * len(rpdo1.content)
-        self._deadline_ns: Final[int] = math.floor(plan.cycle_ns * DEADLINE_SHARE)
+        self._deadline_ns: Final[int] = floor(plan.cycle_ns * DEADLINE_SHARE)
         self._q: list[float] = [0.0] * count
         self._dq: list[float] = [0.0] * count
-        self._heard: int = 0
-        self._all_heard: Final[int] = (1 << count) - 1
+        self._heard: list[bool] = [False] * count
+        self._unheard: int = count
         self._computed: bool = True
         self._words: list[int] = [0] * count
         self._cycle: int = -1
@@ -123,53 +140,64 @@ class HighLevelController(MasterApplication):
 
     def operational(self, now: int, out: Out) -> None:
         """All devices are started: enable the drives."""
-        self.phase = Phase.ENABLING
+        self.phase = _ENABLING
         self._give_up_at = now + ENABLE_TIMEOUT_NS
 
     def synchronised(self, now: int, out: Out) -> None:
         """A new cycle begins."""
         self._cycle += 1
-        self._heard = 0
+        self._heard = [False] * len(self._q)
+        self._unheard = len(self._q)
         self._computed = False
         self.wake_at = now + self._deadline_ns
-        if self.phase is Phase.ENABLING:
+        if self.phase is _ENABLING:
             self._try_start(now)
-        if self.phase is Phase.STARTING and self._cycle - self._fade_in >= self.controller.time_zero_cycle:
-            self.phase = Phase.MOTION
+        if self.phase is _STARTING and self._cycle - self._fade_in >= self.controller.time_zero_cycle:
+            self.phase = _MOTION
             self.time_zero = now
-        if self.phase is Phase.MOTION:
+        if self.phase is _MOTION:
             if self._motion_cycle >= self.motion_cycles:
                 self.completed = True
                 self._stop(now, out)
-        elif self.phase is Phase.STOPPING:
+        elif self.phase is _STOPPING:
             self._try_leave(now)
-        if self.phase in (Phase.STARTING, Phase.MOTION) and self._motion_cycle % ids.STATUS_EVERY == 0:
+        if self.phase in (_STARTING, _MOTION) and self._motion_cycle % ids.STATUS_EVERY == 0:
             self._send_status(out)
 
     def process_data(self, now: int, slave: int, pdo: int, data: bytes, out: Out) -> None:
         """TPDO1: samples of a drive; TPDO2: its statusword."""
         if pdo == 1:
-            if len(data) < self._samples_codec.size:
+            if len(data) < self._samples_size:
                 return
-            values = self._samples_codec.unpack(data)
+            values = self._unpack_samples(data)
             angle = self._angle[slave]
             self._q[slave] = values[self._position_at] * angle
             self._dq[slave] = values[self._velocity_at] * angle
-            self._heard |= 1 << slave
-            if self._heard == self._all_heard and not self._computed:
+            if not self._heard[slave]:
+                self._heard[slave] = True
+                self._unheard -= 1
+            if self._unheard == 0 and not self._computed:
                 self._compute(now, out)
         elif pdo == 2 and len(data) >= self._status_codec.size:
             self._status(now, slave, self._status_codec.unpack(data)[self._statusword_at], out)
 
     def emergency(self, now: int, slave: int, emergency: Emergency, out: Out) -> None:
-        """An EMCY: noted; what follows is decided by the statusword and the heartbeat."""
+        """An EMCY: noted; one with which the drive drops its torque ends the motion."""
         text = "errors gone" if emergency.code == NO_ERROR else f"error {emergency.code:04X}"
         self._note(now, slave, "emcy", f"{text}, error register {emergency.register:02X}")
+        if emergency.code in STOPPING_ERRORS and self.phase in (_STARTING, _MOTION):
+            self._stop(now, out)
 
     def node_lost(self, now: int, slave: int, out: Out) -> None:
         """A drive went silent: end the motion."""
         self._note(now, slave, "heartbeat_lost", "heartbeat lost")
-        if self.phase in (Phase.ENABLING, Phase.STARTING, Phase.MOTION):
+        if self.phase in (_ENABLING, _STARTING, _MOTION):
+            self._stop(now, out)
+
+    def left_operational(self, now: int, slave: int, state: int, out: Out) -> None:
+        """A drive takes no process data any more: end the motion."""
+        self._note(now, slave, "nmt_state", f"left Operational: NMT state {state}")
+        if self.phase in (_ENABLING, _STARTING, _MOTION):
             self._stop(now, out)
 
     def rebooted(self, now: int, slave: int, out: Out) -> None:
@@ -180,15 +208,15 @@ class HighLevelController(MasterApplication):
     def failed(self, now: int, reason: str, out: Out) -> None:
         """The start failed."""
         self.events.append(Event(now, "", "start_failed", reason))
-        self.phase = Phase.FAILED
+        self.phase = _FAILED
 
     def wake(self, now: int, out: Out) -> None:
         """The deadline of the cycle: compute with what there is."""
         self.wake_at = NEVER
         if not self._computed:
-            if self.phase is Phase.MOTION:
+            if self.phase is _MOTION:
                 for slave in range(len(self.late)):
-                    if not self._heard >> slave & 1:
+                    if not self._heard[slave]:
                         self.late[slave] += 1
             self._compute(now, out)
 
@@ -204,44 +232,42 @@ class HighLevelController(MasterApplication):
         self._computed = True
         self.wake_at = NEVER
         phase = self.phase
-        if phase is Phase.STARTING or phase is Phase.MOTION:
+        if phase is _STARTING or phase is _MOTION:
             controller = self.controller
             tau = controller.step(self._cycle - self._fade_in, self._q, self._dq)
-            if phase is Phase.MOTION:
+            if phase is _MOTION:
                 state = controller.state
                 self.samples.append(Sample(self._motion_cycle, state.q_d, state.dq_d, state.tau_command))
-            slave = 0
-            for cob_id in self._rpdo:
-                self._send_command(cob_id, 0x0F, math.floor(tau[slave] / self._torque[slave] + 0.5), out)
-                slave += 1
-        elif phase is Phase.ENABLING or phase is Phase.STOPPING:
+            # torque in per mille of rated, within int16 because the clamp lies far below its range
+            command, torque_at, encode = self._command, self._torque_at, self._encode_command
+            command[self._controlword_at] = 0x0F
+            for slave, cob_id in enumerate(self._rpdo):
+                command[torque_at] = floor(tau[slave] / self._torque[slave] + 0.5)
+                out.send(0, Frame(cob_id, encode(*command)))
+        elif phase is _ENABLING or phase is _STOPPING:
             for slave in range(len(self._rpdo)):
                 word = 0x00
-                if phase is Phase.ENABLING:
+                if phase is _ENABLING:
                     word = enabling_controlword(self.states[slave])
                     if word & 0x80 and self._words[slave] & 0x80:
                         word = 0x00  # fault reset needs a rising edge
                 self._words[slave] = word
-                self._send_command(self._rpdo[slave], word, 0, out)
-
-    def _send_command(self, cob_id: int, controlword: int, torque_raw: int, out: Out) -> None:
-        """An RPDO1; torque in per mille of rated, within int16 because the clamp lies far below its range."""
-        self._command[self._controlword_at] = controlword
-        self._command[self._torque_at] = torque_raw
-        out.send(0, Frame(cob_id, self._command_codec.pack(self._command)))
+                self._command[self._controlword_at] = word
+                self._command[self._torque_at] = 0
+                out.send(0, Frame(self._rpdo[slave], self._encode_command(*self._command)))
 
     def _status(self, now: int, slave: int, statusword: int, out: Out) -> None:
         state = decode_statusword(statusword)
         self.states[slave] = state
-        if self.phase in (Phase.STARTING, Phase.MOTION) and state is not DriveState.OPERATION_ENABLED:
+        if self.phase in (_STARTING, _MOTION) and state is not _OPERATION_ENABLED:
             words = state.name.replace("_", " ").lower() if state is not None else "an undefined state"
             self._note(now, slave, "drive_stopped", f"left Operation enabled: {words}, statusword {statusword:04X}")
             self._stop(now, out)
 
     def _try_start(self, now: int) -> None:
-        waiting = [at for at in range(len(self.states)) if self.states[at] is not DriveState.OPERATION_ENABLED]
+        waiting = [at for at in range(len(self.states)) if self.states[at] is not _OPERATION_ENABLED]
         if not waiting:
-            self.phase = Phase.STARTING
+            self.phase = _STARTING
             self._fade_in = self._cycle
         elif now >= self._give_up_at:
             for slave in waiting:
@@ -251,16 +277,17 @@ class HighLevelController(MasterApplication):
                     now,
                     slave,
                     "start_failed",
-                    f"not in Operation enabled after {ENABLE_TIMEOUT_NS / 1e9:g} s: {words}; check the drive's error code",
+                    f"not in Operation enabled after {ENABLE_TIMEOUT_NS / 1e9:g} s: {words}; "
+                    "check the drive's error code",
                 )
-            self.phase = Phase.STOPPING
+            self.phase = _STOPPING
             self._give_up_at = now + DISABLE_TIMEOUT_NS
 
     def _stop(self, now: int, out: Out) -> None:
         """End the motion; the drives get "disable voltage" from the next torques on."""
-        if self.phase in (Phase.STOPPING, Phase.STOPPED):
+        if self.phase in (_STOPPING, _STOPPED):
             return
-        self.phase = Phase.STOPPING
+        self.phase = _STOPPING
         self._give_up_at = now + DISABLE_TIMEOUT_NS
         self._send_status(out)
 
@@ -270,20 +297,20 @@ class HighLevelController(MasterApplication):
             return
         for slave in enabled:
             self._note(now, slave, "still_enabled", "did not report that it is disabled")
-        self.phase = Phase.STOPPED
+        self.phase = _STOPPED
         self._computed = True
         self.wake_at = NEVER
         self.finished = True
 
     def _send_status(self, out: Out) -> None:
         state, cycle, phase = ids.STATUS_STOPPED, 0, 0
-        if self.phase is Phase.STARTING:
+        if self.phase is _STARTING:
             state = ids.STATUS_STARTING
-        elif self.phase is Phase.MOTION:
+        elif self.phase is _MOTION:
             state = ids.STATUS_MOTION
             cycle = self._motion_cycle & 0xFFFF
-        if self.phase in (Phase.STARTING, Phase.MOTION):
-            phase = math.floor(self.controller.phase(self._cycle - self._fade_in) * 65536) & 0xFFFF
+        if self.phase in (_STARTING, _MOTION):
+            phase = floor(self.controller.phase(self._cycle - self._fade_in) * 65536) & 0xFFFF
         out.send(0, Frame(ids.HLC_STATUS, _STATUS.pack(state, cycle, phase)))
 
     def _note(self, now: int, slave: int, kind: str, text: str) -> None:

@@ -5,18 +5,26 @@ Source: CiA 402-2 / IEC 61800-7-201: objects 0x6007, 0x603F, 0x6040, 0x6041, 0x6
 Leaves out: every mode but CST, following error, position limits, temperature, supply; no mode has a ramp.
 """
 
-import math
+from math import floor
 from typing import Final, final
 
 from canopen_exo.cia402 import FAULT_RESET_BIT, INTERNAL_LIMIT, DriveCommand, DriveState, DriveStateMachine
 from canopen_exo.device import Application
 from canopen_exo.od import ABORT_VALUE, ObjectDictionary
 from canopen_exo.pdo import key_of
-from joint_emulators.sensors import EncoderParams, VelocityEstimateParams, VelocityEstimateState, encode, estimate_velocity, to_int32
+from joint_emulators.sensors import (
+    EncoderParams,
+    VelocityEstimateParams,
+    VelocityEstimateState,
+    encode,
+    estimate_velocity,
+    to_int32,
+)
 
 CYCLIC_SYNCHRONOUS_TORQUE: Final = 10
 NO_MODE: Final = 0
 
+ERROR_REGISTER: Final = key_of(0x1001, 0)
 ABORT_CONNECTION: Final = key_of(0x6007, 0)
 ERROR_CODE: Final = key_of(0x603F, 0)
 CONTROLWORD: Final = key_of(0x6040, 0)
@@ -52,7 +60,7 @@ class Drive(Application):
         self.torque_nm: float = 0.0
         self.position_counts: int = 0
         self.torque_actual_nm: float = 0.0
-        self._nm_per_raw: float = od.values[RATED_TORQUE] * 1e-6
+        self._nm_per_raw: float = od.values[RATED_TORQUE] / 1_000_000
         self._driving: bool = False
         self._limited: bool = False
 
@@ -72,7 +80,10 @@ class Drive(Application):
 
     def applied(self, now: int) -> None:
         """New process data: controlword and target torque."""
-        controlword = self.od.values[CONTROLWORD]
+        values = self.od.values
+        controlword = values[CONTROLWORD]
+        if controlword & FAULT_RESET_BIT and values[ERROR_REGISTER]:
+            controlword &= ~FAULT_RESET_BIT  # no reset while the cause lasts
         machine = self.machine
         if controlword != machine.last:
             if machine.controlword(controlword):
@@ -80,6 +91,8 @@ class Drive(Application):
                     machine.command(DriveCommand.DISABLE_VOLTAGE)  # 605A = 0
                 elif machine.state is DriveState.SWITCH_ON_DISABLED and controlword & FAULT_RESET_BIT:
                     self.od.set(ERROR_CODE, 0)
+            self._update()
+        elif values[MODE] != values[MODE_DISPLAY]:  # a mapped 0x6060
             self._update()
         else:
             self._command_torque()
@@ -89,7 +102,7 @@ class Drive(Application):
         values = self.od.values
         values[POSITION] = self.position_counts
         values[VELOCITY] = to_int32(self.estimate.filtered)
-        raw = math.floor(self.torque_actual_nm / self._nm_per_raw + 0.5)
+        raw = floor(self.torque_actual_nm / self._nm_per_raw + 0.5)
         values[TORQUE] = raw if -32768 <= raw <= 32767 else (32767 if raw > 0 else -32768)
 
     def left_operational(self, now: int) -> None:
@@ -100,6 +113,11 @@ class Drive(Application):
         """Heartbeat, SYNC or RPDO lost: react as object 0x6007 says."""
         self.od.set(ERROR_CODE, code)
         self._abort_connection()
+
+    def errors_gone(self) -> None:
+        """Object 0x603F keeps the code of a fault until the fault is reset, and of nothing else."""
+        if self.machine.state is not DriveState.FAULT:
+            self.od.set(ERROR_CODE, 0)
 
     def check(self, key: int, raw: int) -> int:
         """SDO writes: only the modes there are."""
@@ -119,6 +137,7 @@ class Drive(Application):
     def _abort_connection(self) -> None:
         option = self.od.values[ABORT_CONNECTION]
         machine = self.machine
+        machine.last &= FAULT_RESET_BIT  # the next controlword counts, even when it is the same again
         if option == _FAULT_SIGNAL:
             if machine.state is not DriveState.SWITCH_ON_DISABLED:
                 machine.fault()

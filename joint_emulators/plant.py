@@ -6,6 +6,7 @@ Left out: sensors (joint_emulators.sensors), drive firmware, contacts (the model
 """
 
 import copy
+import struct
 from dataclasses import dataclass
 from typing import Final, final
 
@@ -54,7 +55,8 @@ class Plant:
         self._gears = layout.gears
         self._model = model
         self._data = data
-        self._ctrl = memoryview(data.ctrl).cast("B").cast("d")
+        self._ctrl = memoryview(data.ctrl).cast("B")
+        self._pack = struct.Struct(f"{n}d").pack_into
         self._qpos = data.qpos[qpos_at : qpos_at + n]
         self._qvel = data.qvel[dof_at : dof_at + n]
         self._torque = data.qfrc_actuator[dof_at : dof_at + n]
@@ -84,12 +86,13 @@ class Plant:
 
         Raises JointEmulatorError when a command or the state after the step is not finite.
         """
-        ctrl, gears = self._ctrl, self._gears
+        shafts: list[float] = []
         total = 0.0
-        for i in range(len(gears)):
-            shaft = tau_command[i] / gears[i]
-            ctrl[i] = shaft
+        for at, gear in enumerate(self._gears):
+            shaft = tau_command[at] / gear
+            shafts.append(shaft)
             total += shaft
+        self._pack(self._ctrl, 0, *shafts)
         if total - total != 0.0:  # infinite or NaN; MuJoCo would silently command zero to all motors
             raise self._not_finite("torque command", tau_command)
         mujoco.mj_step(self._model, self._data)

@@ -10,6 +10,7 @@ from typing import Final, final
 from canopen_exo.bus.frame import Frame
 from canopen_exo.bus.node import Node, Out
 from canopen_exo.device import Device
+from canopen_exo.plan import SYNC
 from joint_emulators.drive import Drive
 from joint_emulators.plant import STEP_NS, Plant
 
@@ -52,12 +53,23 @@ class Rack(Node):
         hearing = self._hearing[can_id]
         if not hearing:
             return
+        if can_id == SYNC:
+            self._synchronise(now, hearing, frame.data, out)
+            return
         for device in hearing:
             device.receive(now, 0, frame, out)
             if device.wake_at < self.wake_at:
                 self.wake_at = device.wake_at
         if can_id == 0 or can_id >= 0x580:  # NMT and SDO may change what the devices listen to
             self._route()
+
+    def _synchronise(self, now: int, hearing: list[Device], data: bytes, out: Out) -> None:
+        wake_at = self.wake_at
+        for device in hearing:
+            device.synchronise(now, data, out)
+            if device.wake_at < wake_at:
+                wake_at = device.wake_at
+        self.wake_at = wake_at
 
     def wake(self, now: int, out: Out) -> None:
         """The plant's next step, and the devices' timers."""
@@ -83,10 +95,8 @@ class Rack(Node):
 
     def _sense(self) -> None:
         q, tau = self.plant.q, self.plant.tau
-        joint = 0
-        for drive in self.drives:
+        for joint, drive in enumerate(self.drives):
             drive.sense(q[joint], tau[joint])
-            joint += 1
 
     def _route(self) -> None:
         """Which devices hear which 11-bit id."""
@@ -98,5 +108,5 @@ class Rack(Node):
         self._revision = revision
         self._hearing = [[] for _ in range(2048)]
         for device in self.devices:
-            for can_id in device.cob_ids():
+            for can_id in set(device.cob_ids()):
                 self._hearing[can_id].append(device)

@@ -8,30 +8,39 @@ Left out: noise, index pulse, nonlinearity, and the faults of sensors.
 
 import math
 from dataclasses import dataclass, field
+from math import floor
 from typing import Final, final
 
 from joint_emulators.errors import JointEmulatorError
 
 INT32_MIN: Final = -(1 << 31)
 INT32_MAX: Final = (1 << 31) - 1
+_LOWEST: Final = float(INT32_MIN)
+_HIGHEST: Final = float(INT32_MAX)
+TURN: Final = 2.0 * math.pi
+"""A revolution [rad]."""
 
 
 def to_int32(value: float) -> int:
     """Nearest integer (half up), clipped to int32: 0x6064 and 0x606C do not wrap."""
-    if value >= INT32_MAX:
+    if value >= _HIGHEST:
         return INT32_MAX
-    if value <= INT32_MIN:
+    if value <= _LOWEST:
         return INT32_MIN
-    return math.floor(value + 0.5)
+    return floor(value + 0.5)
 
 
 @dataclass(frozen=True, slots=True)
 class EncoderParams:
-    """counts_per_revolution: of the joint; offset: counts at q = 0; direction: 1, or -1 when mounted the other way."""
+    """counts_per_revolution: of the joint; offset: counts at q = 0; direction: 1, or -1 when mounted the other way.
+
+    factor: direction times counts a revolution.
+    """
 
     counts_per_revolution: int
     offset: int
     direction: int
+    factor: float = field(init=False)
 
     def __post_init__(self) -> None:
         """Refuse values that are no encoder; raises JointEmulatorError."""
@@ -39,6 +48,7 @@ class EncoderParams:
             raise JointEmulatorError(f"encoder: {self.counts_per_revolution} counts a revolution given, allowed from 1")
         if self.direction not in (1, -1):
             raise JointEmulatorError(f"encoder: direction {self.direction} given, allowed 1 or -1")
+        object.__setattr__(self, "factor", float(self.direction * self.counts_per_revolution))
 
 
 ENCODER: Final = EncoderParams(131072, 0, 1)
@@ -47,7 +57,7 @@ ENCODER: Final = EncoderParams(131072, 0, 1)
 
 def encode(q: float, params: EncoderParams) -> int:
     """Counts at the joint angle q [rad, finite]; clipped at int32 (16384 turns of a 17-bit encoder)."""
-    return to_int32(params.direction * q * params.counts_per_revolution / (2.0 * math.pi) + params.offset)
+    return to_int32(q * params.factor / TURN + params.offset)
 
 
 @dataclass(frozen=True, slots=True)

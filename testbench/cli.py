@@ -7,6 +7,7 @@ Everything heavy is imported by the verb that needs it.
 import argparse
 import os
 import sys
+import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,6 +19,8 @@ USAGE: Final = 2
 INVALID: Final = 3
 INTERRUPTED: Final = 130
 
+_SIM_MODULES: Final = ("mujoco", "matplotlib", "pyarrow")
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one verb; returns the exit code."""
@@ -25,15 +28,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
     verb: Callable[[argparse.Namespace], int] = options.verb
     try:
         return verb(options)
-    except KeyboardInterrupt:
-        _say("interrupted; nothing was written")
-        return INTERRUPTED
+    except (KeyboardInterrupt, Exception) as error:  # noqa: BLE001 - the last resort: exit 1 would read as a verdict
+        if _is_interrupt(error):
+            _say("interrupted")
+            return INTERRUPTED
+        if isinstance(error, ModuleNotFoundError) and (error.name or "").partition(".")[0] in _SIM_MODULES:
+            _say(f"{error.name} is not installed; a run needs the extra sim: pip install 'exo-hil[sim]'")
+            return USAGE
+        traceback.print_exc()
+        _say("exo-hil: this is a defect of the program; nothing about the scenario is proved")
+        return INVALID
+
+
+def _is_interrupt(error: BaseException | None) -> bool:
+    """Whether Ctrl-C is behind it: compiled packages turn one that comes while they load into an ImportError."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error is not None
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="exo-hil",
-        description="CAN-bus hardware-in-the-loop emulator of a lower-limb exoskeleton with wire-level fault injection.",
+        description="CAN-bus hardware-in-the-loop emulator of a lower-limb exoskeleton with wire-level fault injection",
         epilog="Exit codes: 0 pass, 1 verdict fail, 2 usage or bad file, 3 run invalid.",
     )
     parser.add_argument("--version", action=_Version, nargs=0, help="print the version and leave")

@@ -74,11 +74,12 @@ def joint_at_fault(shown: Plotted) -> str:
 def windows(shown: Plotted, joint: str | None = None) -> list[tuple[float, float]]:
     """When faults were active [s], within the motion, overlapping ones joined; of one joint's signals, or of all.
 
-    Faults of whole frames name no joint and belong to every one.
+    Faults of frames that are no joint's alone belong to every one.
     """
     found = []
     for one in shown.faulted.activations:
-        if joint is None or not one.signal or one.signal.partition(".")[0] == joint:
+        owner = one.signal.partition(".")[0]
+        if joint is None or owner == joint or owner not in shown.joints:
             start = max(0, one.start_ns - shown.faulted.time0_ns)
             end = min(shown.faulted.duration_ns, min(one.end_ns, NEVER) - shown.faulted.time0_ns)
             if start < end:

@@ -14,7 +14,7 @@ from canopen_exo.eds import load_eds
 from canopen_exo.master import Expected, Master, SlaveConfig, Write
 from canopen_exo.od import ObjectDictionary
 from canopen_exo.pdo import INVALID, key_of
-from canopen_exo.plan import MASTER_ID, TPDO2, BusPlan, JointNode
+from canopen_exo.plan import MASTER_ID, BusPlan, JointNode, Pdo
 from fi_gateway.gateway import Gateway
 from fi_gateway.injector import Injector
 from hlc.controller import build_controller, paper_params
@@ -95,10 +95,30 @@ def _rack(plan: BusPlan, mjcf: str, names: tuple[str, ...]) -> Rack:
     return Rack(Plant(mjcf, names), devices, drives)
 
 
+def _pdo_writes(plan: BusPlan, pdo: Pdo, joint: JointNode) -> list[Write]:
+    """A PDO as the plan has it, by the standard procedure: not valid, no entries, entries, their number, valid.
+
+    A PDO that goes with every n-th SYNC is staggered over the drives: its SYNC start value is the node id.
+    """
+    number, cob_id = int(pdo.name[4:]) - 1, pdo.base + joint.node_id
+    transmits = pdo.name.startswith("T")
+    comm, mapping = (0x1800, 0x1A00) if transmits else (0x1400, 0x1600)
+    writes = [Write(comm + number, 1, INVALID | cob_id, 4), Write(comm + number, 2, pdo.every, 1)]
+    if transmits:
+        writes.append(Write(comm + number, 6, joint.node_id if pdo.every > 1 else 0, 1))
+    else:
+        writes.append(Write(comm + number, 5, max(1, RPDO_DEADLINE_CYCLES * plan.cycle_ns // 1_000_000), 2))
+    writes.append(Write(mapping + number, 0, 0, 1))
+    for sub, mapped in enumerate(pdo.content, 1):
+        writes.append(Write(mapping + number, sub, mapped.index << 16 | mapped.sub << 8 | mapped.length, 4))
+    writes.append(Write(mapping + number, 0, len(pdo.content), 1))
+    writes.append(Write(comm + number, 1, cob_id, 4))
+    return writes
+
+
 def _slave(plan: BusPlan, joint: JointNode) -> SlaveConfig:
     """What the controller expects of a drive, and how it configures it."""
     pattern = ObjectDictionary(load_eds()).values
-    tpdo2 = TPDO2 + joint.node_id
     heartbeat_ms = plan.heartbeat_ns // 1_000_000
     cycle_us = plan.cycle_ns // 1000
     return SlaveConfig(
@@ -117,11 +137,7 @@ def _slave(plan: BusPlan, joint: JointNode) -> SlaveConfig:
             Write(0x1006, 0, 0, 4),  # 0x1019 may only change while 0x1006 is 0
             Write(0x1019, 0, plan.sync_counter, 1),
             Write(0x1006, 0, cycle_us, 4),
-            Write(0x1400, 5, max(1, RPDO_DEADLINE_CYCLES * plan.cycle_ns // 1_000_000), 2),
-            Write(0x1801, 1, INVALID | tpdo2, 4),  # 18xx:6 may only change while the PDO is not valid
-            Write(0x1801, 2, plan.pdo("TPDO2").every, 1),
-            Write(0x1801, 6, joint.node_id, 1),
-            Write(0x1801, 1, tpdo2, 4),
+            *(write for pdo in plan.pdos for write in _pdo_writes(plan, pdo, joint)),
             Write(0x1029, 1, 1, 1),
             Write(0x6007, 0, 2, 2),
             Write(0x6060, 0, 10, 1),

@@ -129,6 +129,7 @@ def record_of(rig: Rig) -> RunRecord:
         which = "faulted run" if rig.gateway.injectors else "golden run"
         reasons = reasons or "the bus carried no status of the controller"
         raise NotStartedError(f"{which}: the motion never began: {reasons}")
+    end = rig.gateway.time_zero + params.duration_ns
     rows = [row for row in rig.rack.truth if zero <= row.time_ns <= zero + params.duration_ns]
     truth = Truth(
         np.array([row.time_ns - zero for row in rows]) / 1e9,
@@ -150,7 +151,7 @@ def record_of(rig: Rig) -> RunRecord:
         duration_ns=params.duration_ns,
         truth=truth,
         commands=commands,
-        activations=rig.gateway.records,
+        activations=[one for one in rig.gateway.records if one.start_ns < end],
         buses=tuple(_stats(rig, medium) for medium in media),
         notes=[
             RigEvent((event.time_ns - zero) / 1e9, event.joint or "HLC", event.kind, event.text)
@@ -175,14 +176,16 @@ def _stats(rig: Rig, medium: Medium) -> BusStats:
 
 
 def _invalid_reasons(rig: Rig) -> list[str]:
-    """Why the run proves nothing: frames lost without a fault, two senders with one id."""
+    """Why the run proves nothing: frames lost without a fault, two senders with one id. A cut bus explains both."""
+    media = (rig.controller_bus, rig.drive_bus)
+    cut = any(medium.cuts for medium in media)
     reasons = []
-    for medium in (rig.controller_bus, rig.drive_bus):
+    for medium in media:
         dropped = sum(port.dropped for port in medium.ports)
-        if dropped:
+        if dropped and not cut:
             reasons.append(f"{medium.name} bus: {dropped} frames lost in full transmit queues")
         if medium.collisions:
             reasons.append(f"{medium.name} bus: two senders with the same CAN id at once, {medium.collisions} times")
-    if not rig.gateway.injectors and not rig.controller.completed:
+    if not rig.gateway.injectors and not cut and not rig.controller.completed:
         reasons.append("the motion was given up without a fault")
     return reasons

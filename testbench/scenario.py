@@ -259,6 +259,9 @@ def _read(document: Document) -> Scenario:
 
 def _check_rig(rig: Rig, motion: Motion | None, document: Document) -> None:
     """Report what the bus cannot carry, and what rig and motion cannot do together."""
+    if motion is not None and motion.duration_ns < rig.cycle_ns:
+        text = f"{format_duration(motion.duration_ns)} is shorter than one control cycle, "
+        document.report(("motion", "duration"), f"{text}{format_duration(rig.cycle_ns)}; allowed: from that on")
     if motion is not None and motion.stride_ns % rig.cycle_ns:
         below = motion.stride_ns - motion.stride_ns % rig.cycle_ns
         nearest = f"{format_duration(below)} or {format_duration(below + rig.cycle_ns)}"

@@ -1,10 +1,10 @@
 """The result folder: written whole, or not at all.
 
-Everything is written into a new folder beside the target (`.<name>.<writer>.<n>.part`), flushed to the disk, and put in
+Everything is written into a new folder beside the target (`.<name>.<writer>.part`), flushed to the disk, and put in
 place by renaming. A previous result is moved aside first and removed last; anything else that stands there is left
 alone and refused. When writing fails or is interrupted, the half-written folder is removed and the previous result is
 back. What a killed process left half-written is removed by the next one that writes to the same place.
-After a power cut between the two renames the previous result is left in `.<name>.<writer>.<n>.old`, whole.
+After a power cut between the two renames the previous result is left in `.<name>.<writer>.old`, whole.
 """
 
 import os
@@ -106,8 +106,9 @@ def write_result(folder: Path, files: Mapping[str, Writer]) -> Path:
     try:
         with _parents(folder.parent):
             _remove_left_over(folder)
-            part = _new_folder(folder, "part")
+            part = _beside(folder, "part")
             try:
+                part.mkdir()
                 for name, write in files.items():
                     write(part / name)
                     _flush(part / name)
@@ -125,17 +126,16 @@ def write_result(folder: Path, files: Mapping[str, Writer]) -> Path:
 
 def _swap(part: Path, folder: Path) -> None:
     """Put `part` in the place of `folder`; whatever fails, what stood there stands there again."""
-    aside: Path | None = None
+    aside = _beside(folder, "old")
     try:
         if folder.exists():
-            aside = _new_folder(folder, "old")
+            aside.mkdir()
             folder.rename(aside / folder.name)
         part.rename(folder)
     finally:
-        if aside is not None:
-            if not folder.exists():
-                (aside / folder.name).rename(folder)
-            shutil.rmtree(aside, ignore_errors=True)
+        if not folder.exists() and (aside / folder.name).exists():
+            (aside / folder.name).rename(folder)
+        shutil.rmtree(aside, ignore_errors=True)
     _flush_folder(folder.parent)
 
 
@@ -146,8 +146,8 @@ def _parents(parent: Path) -> Iterator[None]:
     try:
         for above in [*reversed(parent.parents), parent]:
             if not above.exists():
-                above.mkdir(exist_ok=True)
                 made.append(above)
+                above.mkdir(exist_ok=True)
         yield
     except BaseException:
         for above in reversed(made):
@@ -156,24 +156,16 @@ def _parents(parent: Path) -> Iterator[None]:
         raise
 
 
-def _new_folder(folder: Path, end: str) -> Path:
-    """A new folder beside `folder`, with the usual permissions; nobody else gets the same."""
-    number = 0
-    while True:
-        made = folder.with_name(f".{folder.name}.{_machine()}-{os.getpid()}.{number}.{end}")
-        try:
-            made.mkdir()
-        except FileExistsError:
-            number += 1
-        else:
-            return made
+def _beside(folder: Path, end: str) -> Path:
+    """A new name beside `folder`, known before anything is made there; nobody else gets the same."""
+    return folder.with_name(f".{folder.name}.{_machine()}-{os.getpid()}-{os.urandom(4).hex()}.{end}")
 
 
 def _remove_left_over(folder: Path) -> None:
     """Remove what processes of this machine that are no more left half-written for this folder."""
     if os.name == "nt":  # there is no harmless way to ask for a process
         return
-    written = re.compile(rf"\.{re.escape(folder.name)}\.{_machine()}-([0-9]{{1,9}})\.[0-9]+\.part", re.ASCII)
+    written = re.compile(rf"\.{re.escape(folder.name)}\.{_machine()}-([0-9]{{1,9}})-[0-9a-f]{{8}}\.part", re.ASCII)
     with suppress(OSError):  # a folder one may write in and not read
         for entry in list(folder.parent.iterdir()):
             match = written.fullmatch(entry.name)

@@ -41,14 +41,22 @@ class HashEntry(TypedDict):
 
 
 class InjectionEntry(TypedDict):
-    """One activation. end_s: None when its window had no end; frames: changed or lost; first_*: as in a candump log."""
+    """One activation.
+
+    due_s: time drawn, given or triggered; start_s: when the window opened, later only when a value had to come first;
+    end_s: None when its window had no end; frames: changed or lost, of frames_seen target frames; frames_unfit: too
+    short to act on; saturated: values cut at the signal's range; first_*: as in a candump log.
+    """
 
     injector: str
     index: int
+    due_s: float
     start_s: float
     end_s: float | None
     frames: int
     frames_seen: int
+    frames_unfit: int
+    saturated: int
     signal: str
     cause: str
     first_before: str | None
@@ -56,7 +64,7 @@ class InjectionEntry(TypedDict):
 
 
 class CountEntry(TypedDict):
-    """activated: windows opened; injected: frames the fault acted on; manifested: frames that really changed."""
+    """activated: windows opened; injected: frames the fault acted on; manifested: of those, changed or lost."""
 
     activated: int
     injected: int
@@ -161,9 +169,12 @@ def summary_document(
     document: Summary = {
         "scenario": scenario,
         "seed": seed,
-        "valid": golden.valid and faulted.valid,
-        "invalid_reasons": [f"golden run: {reason}" for reason in golden.invalid_reasons]
-        + [f"faulted run: {reason}" for reason in faulted.invalid_reasons],
+        "valid": judgement.outcome != "invalid",
+        "invalid_reasons": [
+            *(f"golden run: {reason}" for reason in golden.invalid_reasons),
+            *(f"golden run: {one.joint} leaves its range without a fault" for one in judgement.golden_failures),
+            *(f"faulted run: {reason}" for reason in faulted.invalid_reasons),
+        ],
         "verdict": "pass" if judgement.passed else "fail",
         "outcome": judgement.outcome,
         "completed": faulted.completed,
@@ -233,7 +244,7 @@ def versions() -> dict[str, str]:
 def _counts(activations: Sequence[Activation]) -> CountEntry:
     return {
         "activated": len(activations),
-        "injected": sum(one.frames_seen - one.frames_unfit for one in activations),
+        "injected": sum(one.frames_injected for one in activations),
         "manifested": sum(one.frames_changed for one in activations),
     }
 
@@ -242,10 +253,13 @@ def _injection(one: Activation, time0_ns: int) -> InjectionEntry:
     return {
         "injector": one.injector,
         "index": one.index,
+        "due_s": (one.due_ns - time0_ns) / 1e9,
         "start_s": (one.start_ns - time0_ns) / 1e9,
         "end_s": None if one.end_ns >= NEVER else (one.end_ns - time0_ns) / 1e9,
         "frames": one.frames_changed,
         "frames_seen": one.frames_seen,
+        "frames_unfit": one.frames_unfit,
+        "saturated": one.saturated,
         "signal": one.signal,
         "cause": one.cause,
         "first_before": _frame(one.first_before),
@@ -296,6 +310,7 @@ def summary_text(document: Summary) -> str:
     tail = [
         *_joint_lines(document),
         f"golden run: tracking RMSE at most {golden[worst]:.4f} rad ({worst})",
+        *_few(_violation_lines("golden error", document["golden"]["errors"]), 2, "golden errors"),
         *_few(_violation_lines("failure", document["failures"]), 3, "failures"),
         *_few(_violation_lines("error", document["errors"]), 3, "errors"),
         *_expectation_lines(document),
@@ -312,6 +327,7 @@ def _outcome_text(document: Summary) -> str:
         "detected_safe": "detected, drives or controller ended the motion before a failure",
         "error": "error, a torque or speed limit was exceeded",
         "masked": "masked, faults were injected and every limit was kept",
+        "not_manifested": "faults were activated but changed no frame",
         "not_activated": "no fault was activated",
     }[document["outcome"]]
 

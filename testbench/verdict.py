@@ -73,8 +73,9 @@ class Judgement:
     """What is said about a pair of runs.
 
     outcome: invalid, failure, detected_safe (drive or controller ended the motion before a failure), error,
-    not_activated or masked, the first of these that holds; passed: the verdict.
-    golden_errors, golden_failures: of the golden run itself; a rig that breaks limits without a fault shows here.
+    not_activated, not_manifested (no frame really changed) or masked, the first of these that holds; passed: the
+    verdict.
+    golden_errors, golden_failures: of the golden run itself; a golden run with a failure makes the pair invalid.
     """
 
     comparison: dict[str, JointComparison]
@@ -116,7 +117,8 @@ def judge(
     failures = limit_failures(joints, limits, faulted.truth, duration_s, tolerance_rad)
     found = quantities(comparison, tracking, len(errors), len(failures), faulted)
     results = tuple(evaluate(expectation, found) for expectation in expectations)
-    outcome = _outcome(golden.valid and faulted.valid, errors, failures, faulted)
+    golden_failures = limit_failures(joints, limits, golden.truth, duration_s, tolerance_rad)
+    outcome = _outcome(golden.valid and faulted.valid and not golden_failures, errors, failures, faulted)
     passed = (
         outcome not in ("invalid", "failure")
         and not (errors and fail_on == "error")
@@ -129,7 +131,7 @@ def judge(
         failures=failures,
         failures_at_3deg=limit_failures(joints, limits, faulted.truth, duration_s, SOFT_PINS_RAD),
         golden_errors=limit_errors(joints, limits, golden.truth, golden.commands, duration_s),
-        golden_failures=limit_failures(joints, limits, golden.truth, duration_s, tolerance_rad),
+        golden_failures=golden_failures,
         expectations=results,
         tolerance_deg=table_value(math.degrees(tolerance_rad)),
         outcome=outcome,
@@ -149,7 +151,9 @@ def _outcome(
         return "detected_safe"
     if errors:
         return "error"
-    return "masked" if faulted.activations else "not_activated"
+    if not faulted.activations:
+        return "not_activated"
+    return "masked" if any(one.frames_changed for one in faulted.activations) else "not_manifested"
 
 
 def limit_errors(

@@ -1,9 +1,11 @@
-"""Exact length of a classical CAN frame on the wire: CRC-15 and bit stuffing by byte tables.
+"""Exact length of a classical CAN frame on the wire: CRC-15 and bit stuffing, 16 bits a step by tables.
 
 Source: ISO 11898-1 (Bosch CAN 2.0 part B): frame fields, CRC polynomial 0x4599, stuffing from SOF to the last CRC bit.
 Leaves out: CAN FD.
 """
 
+from collections.abc import Callable
+from struct import Struct
 from typing import Final
 
 CRC_POLYNOMIAL: Final = 0x4599
@@ -12,8 +14,7 @@ CRC_POLYNOMIAL: Final = 0x4599
 UNSTUFFED_TAIL: Final = 13
 """CRC delimiter 1, ACK slot 1, ACK delimiter 1, end of frame 7, intermission 3; never stuffed."""
 
-
-def _crc_table() -> list[int]:
+def _crc_of_bytes() -> list[int]:
     table = []
     for byte in range(256):
         crc = byte << 7
@@ -23,49 +24,68 @@ def _crc_table() -> list[int]:
     return table
 
 
-# Stuffing state: 0 = nothing sent yet; 2 * run + bit - 1 for `run` (1..5) equal bits of value `bit`: 1..10.
-# A run of 5 lives only until the stuff bit that ends it is inserted, so the states kept between bits are 0..8.
+def _crc_of_words() -> list[int]:
+    """What 16 bits that arrive at an empty CRC register leave in it, times 2: so it lies as the next 16 bits meet it.
+
+    The register is shorter than the step: XOR its content to the top of the next 16 bits and it is a look-up again.
+    """
+    of_byte = _crc_of_bytes()
+    doubled = list(range(0, 0x10000, 2))  # equal entries share one integer
+    table = []
+    for first in range(256):
+        high, low = of_byte[first] >> 7, of_byte[first] << 8 & 0x7FFF
+        for second in range(256):
+            table.append(doubled[low ^ of_byte[high ^ second]])
+    return table
+
+
+# Stuffing state: 2 * (run - 1) + bit for `run` (1..4) equal bits of value `bit`: 0..7. A run of 5 ends at once with the
+# stuff bit inserted after it. SOF is 0, so "one bit 1" also stands for nothing sent yet.
 def _after_bit(state: int, bit: int) -> tuple[int, int]:
     """The state after one data bit, and the number of stuff bits (0 or 1) it brought."""
-    run = 1
-    if state and (state - 1) & 1 == bit:
-        run = (state + 1) // 2 + 1
+    run = (state >> 1) + 2 if state & 1 == bit else 1
     if run == 5:  # the complement is inserted and starts the next run
-        return 2 + (1 - bit) - 1, 1
-    return 2 * run + bit - 1, 0
+        return 1 - bit, 1
+    return 2 * (run - 1) + bit, 0
 
 
-def _stuff_tables() -> tuple[list[int], list[int]]:
-    after, stuffed = [0] * (9 * 256), [0] * (9 * 256)
-    for state in range(9):
-        for byte in range(256):
-            now, count = state, 0
-            for shift in range(7, -1, -1):
-                now, inserted = _after_bit(now, byte >> shift & 1)
-                count += inserted
-            # kept multiplied by 256, so that `row + byte` is the next index
-            after[state << 8 | byte] = now << 8
-            stuffed[state << 8 | byte] = count
-    return after, stuffed
-
-
-def _head_tables(bits: int) -> tuple[list[int], list[int]]:
-    """State row and stuff count after the first `bits` bits of a frame, by their value."""
-    rows, counts = [], []
-    for value in range(1 << bits):
-        state, count = 0, 0
-        for shift in range(bits - 1, -1, -1):
-            state, inserted = _after_bit(state, value >> shift & 1)
+def _stuffing_of_bytes(state: int) -> list[tuple[int, int]]:
+    """State and number of stuff bits after each byte that follows `state`."""
+    table = []
+    for byte in range(256):
+        now, count = state, 0
+        for shift in range(7, -1, -1):
+            now, inserted = _after_bit(now, byte >> shift & 1)
             count += inserted
-        rows.append(state << 8)
-        counts.append(count)
-    return rows, counts
+        table.append((now, count))
+    return table
 
 
-_CRC: Final[list[int]] = _crc_table()
-_AFTER, _STUFFED = _stuff_tables()
-_HEAD2_ROW, _ = _head_tables(2)
-_HEAD6_ROW, _HEAD6_STUFFED = _head_tables(6)
+def _stuffing_of_words() -> list[list[int]]:
+    """By state and 16 bits: number of stuff bits << 3 | the state that follows; below 40: small integers are shared."""
+    of_byte = [_stuffing_of_bytes(state) for state in range(8)]
+    parts = [[count << 3 | now for now, count in row] for row in of_byte]  # of the second byte
+    moved = [[[entry + (count << 3) for entry in part] for part in parts] for count in range(3)]
+    rows = []
+    for state in range(8):
+        row: list[int] = []
+        for now, count in of_byte[state]:
+            row.extend(moved[count][now])
+        rows.append(row)
+    return rows
+
+
+_CRC: Final[list[int]] = _crc_of_words()
+_STUFFING: Final[list[list[int]]] = _stuffing_of_words()
+_NEXT: Final[list[list[int]]] = [_STUFFING[entry & 7] for entry in range(40)]
+"""The row of the following state, by entry. Look-ups in lists are the cheapest thing CPython does with integers."""
+_COUNT: Final[list[int]] = [entry >> 3 for entry in range(40)]
+"""Stuff bits, by entry."""
+_LAST_COUNT: Final[list[int]] = [(entry >> 3) - (entry & 1) for entry in range(40)]
+"""Stuff bits of the CRC, by entry: its 15 bits were looked up with a 0 after them, which if stuffed left a 1."""
+
+_WORDS: Final[list[Callable[[bytes], tuple[int, ...]]]] = [Struct(f">{size // 2}H").unpack for size in range(15)]
+"""An even number of bytes as 16-bit words."""
 
 
 def header_bits(can_id: int, extended: bool, remote: bool, dlc: int) -> int:
@@ -83,41 +103,58 @@ def header_bits(can_id: int, extended: bool, remote: bool, dlc: int) -> int:
 
 def crc15(header: int, data: bytes) -> int:
     """CRC-15 over the unstuffed bits SOF..data; leading zero bits do not change it (initial value 0)."""
+    stream = header << 8 * len(data) | int.from_bytes(data, "big")
     crc = 0
-    table = _CRC
-    for byte in header.to_bytes(5, "big"):
-        crc = ((crc << 8) & 0x7FFF) ^ table[(crc >> 7) ^ byte]
-    for byte in data:
-        crc = ((crc << 8) & 0x7FFF) ^ table[(crc >> 7) ^ byte]
-    return crc
+    for word in _WORDS[14](stream.to_bytes(14, "big")):
+        crc = _CRC[crc ^ word]
+    return crc >> 1
+
+
+def _head(can_id: int, size: int) -> tuple[list[int], int, int]:
+    """After the 19 header bits of a base data frame: stuffing row, CRC register, length of the frame as known so far.
+
+    The length lacks the stuff bits of data and CRC.
+    """
+    first, second = can_id >> 9, (can_id & 0x1FF) << 7 | size
+    # SOF and two bits of the id; the alternating bits before them bring no stuff bit and stand for an idle bus
+    entry = _STUFFING[1][0x5555 << 3 & 0xFFFF | first]
+    after = _NEXT[entry][second]
+    return _NEXT[after], _CRC[_CRC[first] ^ second], _COUNT[after] + 34 + 8 * size + UNSTUFFED_TAIL
+
+
+_HEADS: Final = [[_head(can_id, size) for can_id in range(0x800)] if size % 2 == 0 else [] for size in range(9)]
+"""By payload size (even) and id."""
 
 
 def frame_bits(can_id: int, data: bytes, extended: bool, remote: bool, dlc: int) -> int:
     """Bits on the wire from SOF to the end of the 3-bit intermission, stuff bits included."""
-    table = _CRC
     size = len(data)
-    if extended:
-        header = header_bits(can_id, True, remote, dlc)
-        crc = crc15(header, data)
-        stream = header << (8 * size + 15) | int.from_bytes(data, "big") << 15 | crc
-        rest = 48 + 8 * size  # 39 + 8n + 15 = 6 + (48 + 8n)
-        head = stream >> rest
-        row = _HEAD6_ROW[head]
-        count = _HEAD6_STUFFED[head] + 54 + 8 * size + UNSTUFFED_TAIL
-    else:
-        header = can_id << 7 | remote << 6 | dlc
-        crc = table[header >> 16]
-        crc = ((crc << 8) & 0x7FFF) ^ table[(crc >> 7) ^ (header >> 8 & 0xFF)]
-        crc = ((crc << 8) & 0x7FFF) ^ table[(crc >> 7) ^ (header & 0xFF)]
-        for byte in data:
-            crc = ((crc << 8) & 0x7FFF) ^ table[(crc >> 7) ^ byte]
-        stream = header << (8 * size + 15) | int.from_bytes(data, "big") << 15 | crc
-        rest = 32 + 8 * size  # 19 + 8n + 15 = 2 + (32 + 8n)
-        row = _HEAD2_ROW[stream >> rest]
-        count = 34 + 8 * size + UNSTUFFED_TAIL
-    after, stuffed = _AFTER, _STUFFED
-    for byte in (stream & ((1 << rest) - 1)).to_bytes(rest >> 3, "big"):
-        index = row + byte
-        count += stuffed[index]
-        row = after[index]
-    return count
+    heads = _HEADS[size]
+    if extended or remote or dlc != size or not heads:
+        return _any_frame_bits(can_id, data, extended, remote, dlc)
+    row, crc, count = heads[can_id]
+    crcs = _CRC
+    word: int
+    for word in _WORDS[size](data):
+        entry = row[word]
+        count += _COUNT[entry]
+        row = _NEXT[entry]
+        crc = crcs[crc ^ word]
+    return count + _LAST_COUNT[row[crc]]
+
+
+def _any_frame_bits(can_id: int, data: bytes, extended: bool, remote: bool, dlc: int) -> int:
+    """The same for every classical frame."""
+    length = (39 if extended else 19) + 8 * len(data)
+    whole = length >> 4 << 1  # bytes in whole words
+    stream = header_bits(can_id, extended, remote, dlc) << 8 * len(data) | int.from_bytes(data, "big")
+    first = stream >> 8 * whole
+    crc = _CRC[first]
+    entry = _STUFFING[1][0x5555 << (length & 15) & 0xFFFF | first]
+    count = _COUNT[entry] + length + 15 + UNSTUFFED_TAIL
+    word: int
+    for word in _WORDS[whole]((stream & (1 << 8 * whole) - 1).to_bytes(whole, "big")):
+        entry = _NEXT[entry][word]
+        count += _COUNT[entry]
+        crc = _CRC[crc ^ word]
+    return count + _LAST_COUNT[_NEXT[entry][crc]]

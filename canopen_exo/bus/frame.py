@@ -17,6 +17,10 @@ FLAG_ESI: Final = 16
 _FD_SIZES: Final = (12, 16, 20, 24, 32, 48, 64)
 
 
+_BASE_ARBITRATION: Final[list[int]] = [can_id << 21 for can_id in range(0x800)]
+"""Of base data frames (ID, RTR 0, IDE 0), so that nothing is computed, and no integer made, per frame."""
+
+
 @final
 class Frame:
     """One CAN frame; never changed after it is made.
@@ -34,8 +38,9 @@ class Frame:
         self.data: Final[bytes] = data
         self.flags: Final[int] = flags
         wire_dlc = len(data)
-        arbitration = can_id << 21
-        if flags or dlc >= 0 or wire_dlc > 8 or can_id < 0 or can_id > 0x7FF:  # not the frames of nearly every cycle
+        if flags == 0 and dlc < 0 and wire_dlc <= 8 and 0 <= can_id <= 0x7FF:  # the frames of nearly every cycle
+            arbitration = _BASE_ARBITRATION[can_id]
+        else:
             check_frame(can_id, data, flags, dlc)
             wire_dlc = dlc if dlc >= 0 else _wire_dlc(wire_dlc)
             remote = 1 if flags & FLAG_REMOTE else 0
@@ -49,10 +54,13 @@ class Frame:
 
     def measure(self) -> int:
         """Work out `bits`; once is enough, both hops of a gateway use it."""
-        self.bits = frame_bits(
-            self.can_id, self.data, self.flags & FLAG_EXTENDED != 0, self.flags & FLAG_REMOTE != 0, self.dlc
-        )
-        return self.bits
+        flags = self.flags
+        if flags == 0:
+            bits = frame_bits(self.can_id, self.data, False, False, self.dlc)
+        else:
+            bits = frame_bits(self.can_id, self.data, flags & FLAG_EXTENDED != 0, flags & FLAG_REMOTE != 0, self.dlc)
+        self.bits = bits
+        return bits
 
     def with_data(self, data: bytes) -> "Frame":
         """The same frame with another payload of the same length."""

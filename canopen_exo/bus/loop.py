@@ -60,38 +60,55 @@ class Loop:
 
     def run_until(self, until: int) -> None:
         """Serve every instant up to and including `until` [ns]."""
+        if until < self.now:
+            raise CanopenExoError(f"loop: run until {until} ns given, it is {self.now} ns; time does not go back")
         media = self.media
         trace = self.trace
         for medium in media:  # queued between two calls, or the cable was mended
-            if medium.waiting and medium.end == NEVER:
+            if medium.waiting and medium.on_wire is None:
                 medium.arbitrate(self.now)
         wake = self._first_wake()
         if wake < self.now:
-            raise CanopenExoError(f"loop: a node asks to be woken at {wake} ns, it is {self.now} ns; wake_at must move on")
+            raise CanopenExoError(
+                f"loop: a node asks to be woken at {wake} ns, it is {self.now} ns; wake_at must move on"
+            )
+        end = self._first_end()
         while True:
-            now = wake
-            for medium in media:
-                if medium.end < now:
-                    now = medium.end
+            now = wake if wake < end else end
             if now > until:
                 self.now = until
                 return
-            for medium in media:
-                if medium.end == now:
-                    frame = medium.frame
-                    assert frame is not None
-                    medium.end = NEVER
-                    trace.append(Transmission(now, medium.index, frame, medium.sender))
-                    for listener in medium.ports[medium.sender].listeners:
-                        node = listener.node
-                        node.receive(now, listener.port, frame, listener.out)
-                        if node.wake_at < wake:
-                            wake = node.wake_at
+            if end == now:
+                for medium in media:
+                    if medium.end == now:
+                        row = medium.on_wire
+                        assert row is not None
+                        medium.on_wire = None
+                        medium.end = NEVER
+                        trace.append(row)
+                        frame = row.frame
+                        for listener in medium.ports[row.sender].listeners:
+                            node = listener.node
+                            node.receive(now, listener.port, frame, listener.out)
+                            if node.wake_at < wake:
+                                wake = node.wake_at
             if wake <= now:
                 wake = self._wake(now)
+            end = NEVER
             for medium in media:
-                if medium.waiting and medium.end == NEVER:
+                if medium.on_wire is None:
+                    if not medium.waiting:
+                        continue
                     medium.arbitrate(now)
+                if medium.end < end:
+                    end = medium.end
+
+    def _first_end(self) -> int:
+        end = NEVER
+        for medium in self.media:
+            if medium.end < end:
+                end = medium.end
+        return end
 
     def _first_wake(self) -> int:
         wake = NEVER
@@ -102,8 +119,7 @@ class Loop:
 
     def _wake(self, now: int) -> int:
         """Wake the nodes that are due, by index; returns when the next one is."""
-        index = 0
-        for node in self.nodes:
+        for index, node in enumerate(self.nodes):
             if node.wake_at <= now:
                 node.wake(now, self.outs[index])
                 if node.wake_at <= now:
@@ -111,5 +127,4 @@ class Loop:
                         f"loop: node {index} ({type(node).__name__}) asks to be woken at {node.wake_at} ns again, "
                         f"it is {now} ns; wake() must move wake_at on"
                     )
-            index += 1
         return self._first_wake()

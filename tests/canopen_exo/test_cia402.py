@@ -224,19 +224,21 @@ STATUS = {
 }
 
 
-def states_of(word: int) -> list[DriveState]:
-    bits = [f"{word >> at & 1}" for at in (6, 5, 3, 2, 1, 0)]
-    return [
-        STATES[name]
-        for name, pattern in STATUS.items()
-        if all(want in ("x", bit) for want, bit in zip(pattern, bits, strict=True))
-    ]
+def mask_and_value(pattern: str) -> tuple[int, int]:
+    """The bits a pattern looks at, and what they must be."""
+    mask = value = 0
+    for want, bit in zip(pattern, (6, 5, 3, 2, 1, 0), strict=True):
+        if want != "x":
+            mask |= 1 << bit
+            value |= int(want) << bit
+    return mask, value
 
 
 def test_every_statusword_is_decoded_as_the_table_says() -> None:
     """All 65536 words: at most one state fits; a pattern the standard does not define is None; nothing raises."""
+    coding = [(STATES[name], *mask_and_value(pattern)) for name, pattern in STATUS.items()]
     for word in range(65536):
-        found = states_of(word)
+        found = [state for state, mask, value in coding if word & mask == value]
         assert len(found) <= 1
         assert decode_statusword(word) is (found[0] if found else None), hex(word)
 

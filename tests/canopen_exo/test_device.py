@@ -324,6 +324,17 @@ def test_event_driven_rpdo_is_applied_at_once(kind: int) -> None:
     assert bench.application.calls("applied") == [(11 * MS, 7)]
 
 
+@pytest.mark.parametrize("kind", [1, 255])
+def test_value_received_before_the_start_is_not_applied(kind: int) -> None:
+    """CiA 301, table 38: no PDO in Pre-operational, neither at once nor with the first SYNC after the start."""
+    bench = booted()
+    bench.map(0x1400, RPDO1, kind, CONTROLWORD, TARGET_TORQUE)
+    bench.hear(11 * MS, RPDO1, struct.pack("<Hh", 15, 99))
+    bench.nmt(START)
+    bench.sync(12 * MS)
+    assert (bench.application.calls("applied"), bench.od.value(0x607100)) == ([], 0)
+
+
 def test_pending_value_is_forgotten_on_leaving_operational() -> None:
     """What was received before must not act after the next start."""
     bench = operational()
@@ -643,6 +654,20 @@ def test_error_behaviour_is_that_of_object_1029(state: NmtState, behaviour: int)
     assert bench.device.nmt.state is after
     assert bench.emergencies() == [(320 * MS, 0x8130, 0x11)]
     assert bench.application.calls("lost") == [(320 * MS, 0x8130)]
+
+
+@pytest.mark.parametrize("behaviour", [0, 1, 2])
+def test_error_behaviour_does_not_lead_out_of_stopped(behaviour: int) -> None:
+    """CiA 301, object 1029:1: Pre-operational only from Operational; the EMCY waits until it may be sent."""
+    bench = booted()
+    bench.write(0x1016, 1, 127 << 16 | 300, 4)
+    bench.write(0x1029, 1, behaviour, 1)
+    bench.hear(20 * MS, 0x77F, b"\5")
+    bench.nmt(STOP)
+    bench.run(1000 * MS)
+    assert (bench.device.nmt.state, bench.emergencies()) == (NmtState.STOPPED, [])
+    bench.nmt(PRE)
+    assert bench.emergencies() == [(1000 * MS, 0x8130, 0x11)]
 
 
 def test_error_behaviour_has_three_values() -> None:

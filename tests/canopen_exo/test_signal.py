@@ -233,10 +233,13 @@ def test_64_bits_are_taken() -> None:
     assert compile_codec([(1, False)] * 64).size == 8
 
 
-def drive_pdo() -> canopen.RemoteNode:
+def description() -> canopen.ObjectDictionary:
     source = io.StringIO(resources.files("dbc").joinpath("exo_joint.eds").read_text(encoding="ascii"))
     source.name = "exo_joint.eds"
-    return canopen.RemoteNode(5, canopen.import_od(source, 5))
+    return canopen.import_od(source, 5)
+
+
+DESCRIPTION = description()
 
 
 OBJECTS = [(0x6041, 16, False), (0x6064, 32, True), (0x606C, 32, True), (0x6077, 16, True), (0x1001, 8, False)]
@@ -247,8 +250,7 @@ MAPPINGS = [(0,), (1, 2), (0, 3, 0), (4, 1, 3), (4, 4, 0, 2), (3, 1, 0)]
 @given(data=st.data())
 def test_canopen_package_reads_and_writes_the_same_payload(data: st.DataObject, chosen: tuple[int, ...]) -> None:
     """The PDO code of the canopen package as reader and as writer of byte-aligned mappings."""
-    node = drive_pdo()
-    pdo = node.tpdo[1]
+    pdo = canopen.RemoteNode(5, DESCRIPTION).tpdo[1]
     pdo.clear()
     objects = [OBJECTS[at] for at in chosen]
     for index, _, _ in objects:

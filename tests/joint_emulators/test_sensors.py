@@ -21,8 +21,8 @@ from joint_emulators.sensors import (
     VelocityEstimateState,
     encode,
     estimate_velocity,
-    to_int32,
     hall_state,
+    to_int32,
 )
 
 COUNT_RAD = 2.0 * math.pi / 131072

@@ -177,10 +177,11 @@ def wide(joint: str, **changed: float) -> dict[str, JointLimits]:
         (True, wide("right_knee"), "masked", True),
         (True, wide("right_knee", torque_nm=1.0), "error", True),
         (True, wide("right_knee", speed_rad_s=0.1), "error", True),
-        (True, wide("right_knee", max_angle_rad=-0.5), "failure", False),
-        (True, wide("right_knee", min_angle_rad=-0.5), "failure", False),
-        (True, wide("right_knee", torque_nm=1.0, max_angle_rad=-0.5), "failure", False),
-        (False, wide("right_knee", max_angle_rad=-0.5), "failure", False),
+        (True, wide("right_knee", max_angle_rad=0.5), "failure", False),
+        (True, wide("right_knee", torque_nm=1.0, max_angle_rad=0.5), "failure", False),
+        (False, wide("right_knee", max_angle_rad=0.5), "failure", False),
+        (True, wide("right_knee", max_angle_rad=-0.5), "invalid", False),  # the golden run fails as well
+        (True, wide("right_knee", min_angle_rad=-0.5), "invalid", False),
         (False, wide("right_knee", torque_nm=1.0), "error", True),
     ],
 )
@@ -193,7 +194,8 @@ def test_outcome_is_the_worst_that_happened(
     passed: bool,
 ) -> None:
     """Verdict: any failure fails, errors alone do not."""
-    found = judge(SIX, limits, run_maker(), run_maker(activations=[activation_maker()] if activated else []))
+    faulted = run_maker(bump_rad=2.0, activations=[activation_maker()] if activated else [])
+    found = judge(SIX, limits, run_maker(), faulted)
     assert (found.outcome, found.passed) == (outcome, passed)
 
 
@@ -229,12 +231,12 @@ def test_tolerance_moves_failures_but_not_the_count_at_3_deg(run_maker: RunMaker
 
 
 def test_golden_run_is_judged_for_itself(run_maker: RunMaker) -> None:
-    """A rig that is beyond limits without any fault is seen as such; the verdict is about the faulted run."""
+    """A rig that fails without any fault proves nothing about faults: the pair is invalid, and says why."""
     found = judge(SIX, LIMITS, run_maker(bump_rad=2.0), run_maker())
     assert [entry.kind for entry in found.golden_failures] == ["max_angle"]
     assert {entry.kind for entry in found.golden_errors} == {"torque", "speed"}
     assert found.failures == found.errors == ()
-    assert found.passed
+    assert (found.outcome, found.passed) == ("invalid", False)
 
 
 @pytest.mark.parametrize(

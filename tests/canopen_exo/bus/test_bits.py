@@ -1,7 +1,7 @@
 """Wire length and CRC of classical frames, against the vectors of the standard's rules and a naive reference."""
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from canopen_exo.bus.bits import UNSTUFFED_TAIL, crc15, frame_bits, header_bits
@@ -126,6 +126,7 @@ def test_a_run_may_end_with_the_last_crc_bit() -> None:
     assert found > 0
 
 
+@settings(max_examples=400)
 @given(can_id=st.integers(0, 0x7FF), data=PAYLOADS)
 def test_base_data_frame_has_the_reference_crc_and_length(can_id: int, data: bytes) -> None:
     """ISO 11898-1: base format, 0..8 data bytes."""

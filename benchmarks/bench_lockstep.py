@@ -1,0 +1,208 @@
+"""What a run in lock-step costs, against the bare mj_step loop of the same plant, and what its pieces cost.
+
+Each repetition runs, in turn and in one process: the bare loop (same model, as many steps as the run), and a whole run
+from power-up to disabled drives, without and with mechanical stops. CPU time of the process, medians. Building the rig
+is not in it; the collector of reference cycles is off while measuring, as it is during the runs of `exo-hil`.
+Nothing is asserted about time: the budgets stand beside the figures.
+"""
+
+import argparse
+import gc
+import json
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from typing import Final
+
+import mujoco
+
+from canopen_exo.bus.frame import Frame
+from canopen_exo.bus.node import MS, SECOND, Out
+from canopen_exo.plan import RPDO1, SDO_REQUEST, SYNC, TPDO1, BusPlan
+from fi_gateway.effects import Infinite
+from fi_gateway.events import At
+from fi_gateway.faults import Bias
+from fi_gateway.gateway import DRIVE_PORT, Gateway
+from fi_gateway.injector import Injector, Target, stream
+from testbench.rig import Rig, RigParams, build_rig
+from testbench.run import drive_through
+from testbench.scenario import default_joints
+
+STRIDE_NS: Final = 1500 * MS
+DURATION_NS: Final = 7 * SECOND
+
+RATIO_BUDGET: Final = 13.0
+"""Most that a run may cost, in bare mj_step loops."""
+REALTIME_BUDGET: Final = 10.0
+"""Least simulated seconds per second of CPU time."""
+
+CALLS: Final = 2000
+"""Calls of a piece between two looks at the clock."""
+
+Figures = dict[str, float]
+
+
+class Sink(Out):
+    """Takes frames and forgets them."""
+
+    def send(self, port: int, frame: Frame) -> None:
+        pass
+
+
+def seconds(work: Callable[[], object]) -> float:
+    """CPU time of one call, with the collector off."""
+    gc.collect()
+    gc.disable()
+    try:
+        started = time.process_time()
+        work()
+        return time.process_time() - started
+    finally:
+        gc.enable()
+
+
+def rig_of(stops: bool, duration_ns: int = DURATION_NS) -> Rig:
+    """A rig at power-up, without injectors."""
+    return build_rig(RigParams(BusPlan(default_joints()), stops, STRIDE_NS, duration_ns), [])
+
+
+def bare_seconds(rig: Rig, steps: int) -> float:
+    """The plant's model alone, from its rest, without torques."""
+    model = rig.rack.plant.model
+    data = mujoco.MjData(model)
+
+    def loop() -> None:
+        for _ in range(steps):
+            mujoco.mj_step(model, data)
+
+    return seconds(loop)
+
+
+def run_seconds(rig: Rig) -> float:
+    """From power-up to disabled drives."""
+    return seconds(lambda: drive_through(rig, lambda share: None))
+
+
+def run_figures(stops: bool, repeat: int) -> Figures:
+    """Medians of `repeat` bare loops and runs in turn."""
+    bare, whole, ratios = [], [], []
+    steps = 1
+    for _ in range(repeat):
+        rig = rig_of(stops)
+        ran = run_seconds(rig)
+        steps = len(rig.rack.truth)
+        alone = bare_seconds(rig, steps)
+        bare.append(alone)
+        whole.append(ran)
+        ratios.append(ran / alone)
+    return {
+        "simulated_s": steps / 1e3,
+        "bare_us_per_step": statistics.median(bare) / steps * 1e6,
+        "run_us_per_ms": statistics.median(whole) / steps * 1e6,
+        "ratio": statistics.median(ratios),
+        "x_realtime": steps / 1e3 / statistics.median(whole),
+    }
+
+
+def piece_us(work: Callable[[], object], repeat: int) -> float:
+    """Median CPU time of one call [us]."""
+
+    def calls() -> None:
+        for _ in range(CALLS):
+            work()
+
+    return statistics.median(seconds(calls) / CALLS * 1e6 for _ in range(repeat))
+
+
+def piece_figures(repeat: int) -> Figures:
+    """What single steps of the machinery cost [us], on a rig in mid-motion."""
+    rig = rig_of(False)
+    rig.loop.run_until(2 * SECOND + STRIDE_NS)
+    now, out = rig.loop.now, Sink()
+    device = rig.rack.devices[0]
+    sample = next(row.frame for row in reversed(rig.loop.trace) if row.frame.can_id == TPDO1 + device.node_id)
+    command = next(row.frame for row in reversed(rig.loop.trace) if row.frame.can_id == RPDO1 + device.node_id)
+    sync = next(row.frame for row in reversed(rig.loop.trace) if row.frame.can_id == SYNC)
+    read = Frame(SDO_REQUEST + device.node_id, bytes.fromhex("4018100100000000"))  # upload 1018:01
+
+    def command_and_sync() -> None:
+        device.receive(now, 0, command, out)
+        device.receive(now, 0, sync, out)
+
+    received = piece_us(lambda: device.receive(now, 0, command, out), repeat)
+    return {
+        "frame_new": piece_us(lambda: Frame(sample.can_id, sample.data), repeat),
+        "frame_length_8_bytes": piece_us(sample.measure, repeat),
+        "frame_length_4_bytes": piece_us(command.measure, repeat),
+        "rpdo_received": received,
+        "sync_to_tpdo": piece_us(command_and_sync, repeat) - received,
+        "sdo_answer": piece_us(lambda: device.receive(now, 0, read, out), repeat),
+        "gateway_frame_no_injector": piece_us(lambda: rig.gateway.receive(now, DRIVE_PORT, sample, out), repeat),
+        "gateway_frame_injected": injected_us(rig, sample, repeat),
+    }
+
+
+def injected_us(rig: Rig, frame: Frame, repeat: int) -> float:
+    """A frame through a gateway whose injector adds a bias to its position, the injector included [us]."""
+    plan = rig.params.plan
+    signal = next(one for one in plan.signals() if one.cob_id == frame.can_id and one.name == "position")
+    target = Target(True, False, (signal.cob_id,))
+    injector = Injector("bias", target, Bias(signal, 100), At((0,)), Infinite(), None, stream(1, 0, "bias"), True, True)
+    gateway = Gateway([injector], plan.cycle_ns)
+    out = Sink()
+    gateway.receive(0, DRIVE_PORT, frame, out)
+    spent = piece_us(lambda: gateway.receive(MS, DRIVE_PORT, frame, out), repeat)
+    if injector.manifested == 0:
+        raise RuntimeError("bench_lockstep: the injector changed no frame, its figure would be that of an idle one")
+    return spent
+
+
+def verdict(met: bool) -> str:
+    """Beside a budget."""
+    return "met" if met else "NOT met"
+
+
+def show(figures: dict[str, Figures]) -> None:
+    """The figures as text."""
+    for name, title in (("stops_off", "without stops"), ("stops_on", "with stops")):
+        run = figures[name]
+        print(f"lock-step run {title}: {run['simulated_s']:.1f} s simulated, two buses, gateway, full trace")
+        print(f"  bare mj_step loop  {run['bare_us_per_step']:8.2f} us per step")
+        print(f"  whole run          {run['run_us_per_ms']:8.2f} us per simulated ms")
+        print(
+            f"  ratio              {run['ratio']:8.1f} x the bare loop   "
+            f"(budget <= {RATIO_BUDGET:g}: {verdict(run['ratio'] <= RATIO_BUDGET)})"
+        )
+        print(
+            f"  speed              {run['x_realtime']:8.1f} x real time       "
+            f"(budget >= {REALTIME_BUDGET:g}: {verdict(run['x_realtime'] >= REALTIME_BUDGET)})"
+        )
+    print("pieces, for information [us]")
+    for name, value in figures["pieces"].items():
+        print(f"  {name.replace('_', ' '):28} {value:6.2f}")
+
+
+def main() -> int:
+    """Measure and print; 0 whatever the figures are."""
+    parser = argparse.ArgumentParser(description="lock-step runs against the bare mj_step loop of the same plant")
+    parser.add_argument("--repeat", type=int, default=5, help="repetitions, of which medians are printed (default 5)")
+    parser.add_argument("--json", action="store_true", help="print one JSON document instead of text")
+    arguments = parser.parse_args()
+    if arguments.repeat < 1:
+        parser.error(f"--repeat {arguments.repeat} given, allowed 1 and more")
+    figures = {
+        "stops_off": run_figures(False, arguments.repeat),
+        "stops_on": run_figures(True, arguments.repeat),
+        "pieces": piece_figures(arguments.repeat),
+    }
+    if arguments.json:
+        budget = {"ratio": RATIO_BUDGET, "x_realtime": REALTIME_BUDGET}
+        print(json.dumps({"repeat": arguments.repeat, "budget": budget, **figures}, indent=2))
+    else:
+        show(figures)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
