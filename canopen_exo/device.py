@@ -324,14 +324,15 @@ class Device(Node):
 
     def _reset(self, now: int, command: NmtCommand) -> None:
         """Reset node: all objects; reset communication: 0x1000..0x1FFF. The boot-up message ends it."""
+        self.emcy.active.clear()
+        self.emcy.queue.clear()
+        self.emcy.history.clear()
+        self._publish_errors()
         if command is NmtCommand.RESET_NODE:
             self.od.reset()
             self.application.reset(now)
         else:
             self.od.reset(communication_only=True)
-        self.emcy.active.clear()
-        self.emcy.queue.clear()
-        self.emcy.history.clear()
         self.emcy.inhibit_ns = self.od.values[key_of(0x1015, 0)] * 100_000  # multiples of 100 us
         self.sdo = SdoServer(self.od, self.node_id)
         self.nmt = NmtSlave()
@@ -340,7 +341,6 @@ class Device(Node):
         self.configure_sync()
         self.configure_pdos()
         self.configure_consumers()
-        self._publish_errors()
         self._plan_wake()
 
     def configure_sync(self) -> None:

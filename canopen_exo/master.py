@@ -269,14 +269,15 @@ class Master(Node):
         self._plan_wake()
 
     def wake(self, now: int, out: Out) -> None:
-        """Serve every timer that is due; SYNC first."""
+        """Serve every timer that is due; SYNC first, or in its place the end of a finished application."""
         application = self.application
-        if application.finished and self.state is _OPERATIONAL:
-            self._stop(out)
         if now >= self.sync_at:
-            out.send(0, self.sync.next())
-            self.sync_at += self.plan.cycle_ns
-            application.synchronised(now, out)
+            if application.finished:
+                self._stop(out)
+            else:
+                out.send(0, self.sync.next())
+                self.sync_at += self.plan.cycle_ns
+                application.synchronised(now, out)
         if now >= application.wake_at:
             application.wake(now, out)
         if now >= self.supervise_at:

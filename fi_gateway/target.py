@@ -215,6 +215,6 @@ def _place(
         signal,
         size,
         f"{what} ({ids}, {way})",
-        f"{owner}.{thing}" if owner and owner != "every joint" else f"{thing} {ids}",
+        f"{owner.removeprefix('the ')}.{thing}" if owner and owner != "every joint" else f"{thing} {ids}",
         direction != "",
     )

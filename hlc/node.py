@@ -3,7 +3,8 @@
 Everything CANopen is the Master's; this is its application. In each cycle the answers of all drives (TPDO1) make the
 torques of the next one; when one does not come before the deadline, its last value is used again and counted.
 Time 0 is the SYNC at which the fade-in of the gait is complete; the HLC status frame tells it to the bus.
-A drive that leaves Operation enabled, or whose heartbeat stops, ends the motion: all drives are disabled.
+A drive that leaves Operation enabled, whose heartbeat stops or tells another NMT state than Operational, or whose EMCY
+says that it drops its torque, ends the motion: all drives are disabled.
 """
 
 import struct
@@ -112,8 +113,8 @@ class HighLevelController(MasterApplication):
         self._names: Final[list[str]] = [joint.name for joint in plan.joints]
         self._angle: Final[list[float]] = [plan.scale(joint, "rad") for joint in plan.joints]
         self._torque: Final[list[float]] = [plan.scale(joint, "N m") for joint in plan.joints]
-        self._rpdo: Final[list[int]] = [ids.RPDO1 + joint.node_id for joint in plan.joints]
         tpdo1, tpdo2, rpdo1 = plan.pdo("TPDO1"), plan.pdo("TPDO2"), plan.pdo("RPDO1")
+        self._rpdo: Final[list[int]] = [rpdo1.base + joint.node_id for joint in plan.joints]
         samples = tpdo1.codec()
         self._samples_size: Final[int] = samples.size
         self._unpack_samples: Final[Callable[[bytes], tuple[int, ...]]] = samples.unpack

@@ -82,9 +82,9 @@ class Drive(Application):
         """New process data: controlword and target torque."""
         values = self.od.values
         controlword = values[CONTROLWORD]
-        if controlword & FAULT_RESET_BIT and values[ERROR_REGISTER]:
-            controlword &= ~FAULT_RESET_BIT  # no reset while the cause lasts
         machine = self.machine
+        if controlword & FAULT_RESET_BIT and not machine.last & FAULT_RESET_BIT and values[ERROR_REGISTER]:
+            controlword &= ~FAULT_RESET_BIT  # no reset while the cause lasts; a bit that is held acts when it is gone
         if controlword != machine.last:
             if machine.controlword(controlword):
                 if machine.state is DriveState.QUICK_STOP_ACTIVE:

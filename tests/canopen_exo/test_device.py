@@ -59,6 +59,9 @@ class Recorder(Application):
     def communication_lost(self, now: int, code: int) -> None:
         self.log.append((now, "lost", code))
 
+    def errors_gone(self) -> None:
+        self.log.append((-1, "gone", 0))
+
     def calls(self, name: str) -> list[tuple[int, int]]:
         return [(now, value) for now, called, value in self.log if called == name]
 
@@ -691,6 +694,71 @@ def test_error_of_the_application_shows_everywhere() -> None:
     assert bench.emergencies()[2:][0][1:] == (0x0000, 0x00)
     assert bench.read(0x1001) == 0
     assert bench.read(0x1003, 0) == 2  # the history stays
+
+
+def test_application_is_told_once_when_the_last_error_is_gone() -> None:
+    """Of two errors the first one that goes is no news; EMCY 0000 is."""
+    bench = operational()
+    bench.hear(11 * MS, RPDO1, bytes(3))
+    bench.hear(12 * MS, SYNC, b"")
+    bench.sync(13 * MS)
+    assert (bench.read(0x1001), bench.application.calls("gone")) == (0x11, [])
+    bench.hear(14 * MS, RPDO1, bytes(4))
+    assert (bench.read(0x1001), len(bench.application.calls("gone"))) == (0, 1)
+    bench.sync(15 * MS)
+    bench.run(100 * MS)
+    assert len(bench.application.calls("gone")) == 1
+
+
+def test_application_is_not_told_of_the_end_of_errors_that_were_not_there() -> None:
+    """Boot, start, process data: nothing was wrong."""
+    bench = booted()
+    bench.nmt(START)
+    for now in range(12, 40, 2):
+        bench.hear(now * MS - 1, RPDO1, bytes(4))
+        bench.sync(now * MS)
+    assert bench.application.calls("gone") == []
+
+
+@pytest.mark.parametrize("how", ["clear", RESET_NODE, RESET_COMMUNICATION])
+def test_application_is_told_when_errors_are_cleared_or_forgotten(how: str | int) -> None:
+    """Fault reset and both NMT resets end every error, so none may stay in the application's objects."""
+    bench = booted()
+    bench.device.error(11 * MS, 0x2310, 0x02, bench)
+    bench.application.log.clear()
+    if isinstance(how, str):
+        bench.device.clear_errors(12 * MS, bench)
+    else:
+        bench.nmt(how)
+    assert len(bench.application.calls("gone")) == 1
+
+
+def test_error_that_ends_while_nothing_may_be_sent_is_told_afterwards() -> None:
+    """CiA 301, table 38: no EMCY in Stopped; register, history and application follow with the messages."""
+    bench = booted()
+    bench.write(0x1016, 1, 127 << 16 | 300, 4)
+    bench.hear(20 * MS, 0x77F, b"\5")
+    bench.run(330 * MS)
+    bench.nmt(STOP)
+    bench.hear(340 * MS, 0x77F, b"\5")
+    assert bench.application.calls("gone") == []
+    bench.nmt(PRE)
+    assert len(bench.application.calls("gone")) == 1
+    assert [item[1:] for item in bench.emergencies()] == [(0x8130, 0x11), (0x0000, 0x00)]
+    assert bench.read(0x1001) == 0
+
+
+def test_messages_of_a_stopped_device_are_bounded() -> None:
+    """An error that comes and goes all night in Stopped: 16 messages wait, the rest is counted; then all is told."""
+    bench = in_state(NmtState.STOPPED)
+    for number in range(50):
+        bench.device.error(20 * MS + number, 0x2310, 0x02, bench)
+        bench.device.clear_errors(20 * MS + number, bench)
+    assert bench.emergencies() == []
+    assert bench.device.emcy.dropped == 100 - 16
+    bench.nmt(PRE)
+    assert [code for _, code, _ in bench.emergencies()] == [0x2310, 0x0000] * 8
+    assert bench.read(0x1001) == 0
 
 
 def test_history_is_cleared_by_writing_0() -> None:

@@ -15,6 +15,7 @@ from canopen_exo.emcy import (
     NO_ERROR,
     PDO_TOO_LONG,
     PDO_TOO_SHORT,
+    QUEUE_LENGTH,
     RPDO_TIMEOUT,
     SYNC_LENGTH,
     SYNC_LOST,
@@ -161,15 +162,63 @@ def test_messages_follow_each_other_without_an_inhibit_time() -> None:
     assert len(sent(producer, 0)) == 3
 
 
+# --- a bounded queue ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("events", [1, 15, 16, 17, 18, 40, 1000])
+def test_messages_that_wait_are_bounded_and_what_finds_no_room_is_counted(events: int) -> None:
+    """A drive whose errors come and go faster than the inhibit time: 16 wait at most, the oldest; nothing grows."""
+    producer = EmcyProducer(5)
+    producer.inhibit_ns = 100 * MS
+    for number in range(events):
+        producer.occur(0x1000 + number, CURRENT)
+    assert QUEUE_LENGTH == 16
+    assert len(producer.queue) == min(events, 16)
+    assert producer.dropped == max(0, events - 16)
+    assert producer.register == 0x03  # the register knows of all of them
+    told = [code for k in range(20) for code, _ in sent(producer, k * 100 * MS)]
+    assert told == list(range(0x1000, 0x1000 + min(events, 16)))
+    assert producer.due == NEVER
+
+
+def test_queue_takes_messages_again_when_one_has_gone() -> None:
+    """Room for one: the next event is told, the one after it is not."""
+    producer = EmcyProducer(5)
+    producer.inhibit_ns = 100 * MS
+    for number in range(16):
+        producer.occur(0x1000 + number, CURRENT)
+    assert producer.wake(0) is not None
+    producer.occur(0x2000, CURRENT)
+    assert producer.dropped == 0
+    producer.occur(0x2001, CURRENT)
+    assert producer.dropped == 1
+    told = [code for k in range(1, 30) for code, _ in sent(producer, k * 100 * MS)]
+    assert told == [*range(0x1001, 0x1010), 0x2000]
+
+
+def test_no_error_that_finds_no_room_is_dropped_and_counted_too() -> None:
+    """Object 0x1001 still tells that all is well."""
+    producer = EmcyProducer(5)
+    producer.inhibit_ns = 100 * MS
+    for number in range(16):
+        producer.occur(0x1000 + number, CURRENT)
+    producer.clear()
+    assert (producer.dropped, producer.register) == (1, 0)
+    assert NO_ERROR not in [code for k in range(20) for code, _ in sent(producer, k * 100 * MS)]
+
+
 @given(
     inhibit=st.integers(0, 50),
-    events=st.lists(st.tuples(st.integers(0, 30), st.integers(0, 3), st.booleans()), max_size=20),
+    events=st.lists(st.tuples(st.integers(0, 30), st.integers(0, 3), st.booleans()), max_size=20)
+    | st.lists(st.tuples(st.integers(0, 3), st.integers(0, 3), st.booleans()), min_size=20, max_size=60),
 )
 def test_every_event_is_told_in_order_and_in_time(inhibit: int, events: list[tuple[int, int, bool]]) -> None:
-    """Whatever happens when: nothing is lost or swapped, and two messages are never closer than the inhibit time."""
+    """Whatever happens when: nothing is swapped, nothing lost but what finds 16 messages waiting, and two messages
+    are never closer than the inhibit time."""
     producer = EmcyProducer(5)
     producer.inhibit_ns = inhibit
-    now, active, expected, times, found = 0, set[int](), [], [], []
+    now, active, times = 0, set[int](), list[int]()
+    expected, found, lost = list[int](), list[int](), 0
 
     def serve(until: int) -> None:
         while producer.due <= until:
@@ -185,14 +234,19 @@ def test_every_event_is_told_in_order_and_in_time(inhibit: int, events: list[tup
         code = 0x2000 + number
         if occurs:
             assert producer.occur(code, CURRENT) == (code not in active)
-            expected += [] if code in active else [code]
+            told = [] if code in active else [code]
             active.add(code)
         else:
             producer.vanish(code)
-            expected += [NO_ERROR] if active == {code} else []
+            told = [NO_ERROR] if active == {code} else []
             active.discard(code)
+        if len(expected) - len(found) < QUEUE_LENGTH:
+            expected += told
+        else:
+            lost += len(told)
+        assert len(producer.queue) <= QUEUE_LENGTH
     serve(now + 100 * (inhibit + 1))
-    assert found == expected
+    assert (found, producer.dropped) == (expected, lost)
     assert all(late - early >= inhibit for early, late in itertools.pairwise(times))
 
 

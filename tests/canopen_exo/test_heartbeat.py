@@ -66,6 +66,34 @@ def test_consumer_waits_for_the_first_heartbeat() -> None:
     assert (consumer.deadline, consumer.lost) == (NEVER, False)
 
 
+def test_consumer_can_watch_before_the_first_heartbeat() -> None:
+    """A master that has started a device waits no longer for its first heartbeat than for any other."""
+    consumer = HeartbeatConsumer(5, 300 * MS)
+    consumer.watch(70 * MS)
+    assert (consumer.deadline, consumer.lost) == (370 * MS, False)
+    consumer.received(100 * MS, b"\5")
+    assert consumer.deadline == 400 * MS
+
+
+@pytest.mark.parametrize(("heard", "deadline"), [(0, 300), (69, 369), (70, 370)])
+def test_watching_gives_no_respite_to_a_producer_heard_before(heard: int, deadline: int) -> None:
+    """The time-out still counts from its last heartbeat."""
+    consumer = HeartbeatConsumer(5, 300 * MS)
+    consumer.received(heard * MS, b"\x7f")
+    consumer.watch(70 * MS)
+    assert consumer.deadline == deadline * MS
+
+
+def test_watching_begins_anew_after_a_loss() -> None:
+    """Lost before the start, and started all the same: it has the time-out to come back."""
+    consumer = HeartbeatConsumer(5, 300 * MS)
+    consumer.received(0, b"\x7f")
+    consumer.lose()
+    consumer.watch(500 * MS)
+    assert (consumer.deadline, consumer.lost) == (800 * MS, True)
+    assert consumer.received(600 * MS, b"\5")
+
+
 @pytest.mark.parametrize("state", [0, 4, 5, 127])
 def test_each_heartbeat_moves_the_deadline(state: int) -> None:
     """Object 1016: the time-out counts from the last heartbeat, whatever its state."""

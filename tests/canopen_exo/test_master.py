@@ -13,7 +13,7 @@ from canopen_exo.bus.node import MS, NEVER, SECOND, Node, Out
 from canopen_exo.device import Application, Device
 from canopen_exo.eds import load_eds
 from canopen_exo.emcy import Emergency
-from canopen_exo.master import Expected, Master, MasterApplication, MasterState, SlaveConfig, Write
+from canopen_exo.master import POWER_UP_NS, Expected, Master, MasterApplication, MasterState, SlaveConfig, Write
 from canopen_exo.nmt import NmtState
 from canopen_exo.od import ObjectDictionary
 from canopen_exo.plan import BusPlan, JointNode
@@ -46,6 +46,9 @@ class Recorder(MasterApplication):
 
     def node_lost(self, now: int, slave: int, out: Out) -> None:
         self.log.append((now, "lost", (slave,)))
+
+    def left_operational(self, now: int, slave: int, state: int, out: Out) -> None:
+        self.log.append((now, "left", (slave, state)))
 
     def rebooted(self, now: int, slave: int, out: Out) -> None:
         self.log.append((now, "rebooted", (slave,)))
@@ -160,19 +163,52 @@ def test_master_boots_configures_and_starts_six_devices() -> None:
 
 
 def test_start_is_in_the_order_of_the_standard() -> None:
-    """Per node: boot-up, device type, product code, rated torque, the writes; one start for all at the end."""
+    """Reset; per node: boot-up, device type, product code, rated torque, the writes; one start for all at the end."""
     rig = Rig(2).run(100 * MS)
     ids = [row.frame.can_id for row in rig.loop.trace]
-    first = rig.loop.trace[:2]
-    assert {row.frame.can_id: row.frame.data for row in first} == {0x77F: b"\0", 0x000: b"\x82\0"}
+    own = [row for row in rig.loop.trace if row.frame.can_id not in (0x701, 0x702)]
+    assert {row.frame.can_id: row.frame.data for row in own[:2]} == {0x77F: b"\0", 0x000: b"\x82\0"}
     assert rig.frames(0x000) == [b"\x82\0", b"\x01\0"]
-    start = max(at for at, can_id in enumerate(ids) if can_id == 0x000)
+    reset, start = (at for at, can_id in enumerate(ids) if can_id == 0x000)
     for node_id in (1, 2):
-        assert ids.index(0x700 + node_id) < ids.index(0x600 + node_id) < start
+        assert reset < ids.index(0x700 + node_id, reset) < ids.index(0x600 + node_id) < start
         requests = [data[:4].hex() for data in rig.frames(0x600 + node_id)]
         assert requests == ["40001000", "40181002", "40766000", "23061000", "2b726000"]
     assert 0x600 not in [can_id & 0x780 for can_id in ids[start:]]
     assert 0x080 not in ids[:start]
+
+
+def test_every_device_serves_reset_communication_before_it_is_configured() -> None:
+    """CiA 302-2: devices powered up with the master are booted when 0x82 comes: each sends a second boot-up message."""
+    rig = Rig()
+    rig.run(POWER_UP_NS - 1)
+    assert (rig.master.state, rig.frames(0x000)) == (MasterState.RESETTING, [])
+    assert {device.nmt.state for device in rig.devices.values()} == {NmtState.PRE_OPERATIONAL}
+    for device in rig.devices.values():
+        device.od.set(0x100600, 12_345)  # left behind by another master
+    rig.run(POWER_UP_NS + MS)
+    (reset,) = rig.ends(0x000)
+    assert reset > POWER_UP_NS
+    assert {device.nmt.state for device in rig.devices.values()} == {NmtState.INITIALISING}
+    assert {device.od.value(0x100600) for device in rig.devices.values()} == {0}
+    rig.run(100 * MS)
+    for node_id in rig.devices:
+        assert rig.frames(0x700 + node_id)[:2] == [b"\0", b"\0"]
+        first, second = rig.ends(0x700 + node_id)[:2]
+        assert first < reset < second < min(rig.ends(0x600 + node_id))
+    assert {device.od.value(0x100600) for device in rig.devices.values()} == {2000}
+
+
+def test_master_needs_no_second_boot_up_of_a_device_that_booted_late() -> None:
+    """A device still initialising does not hear the reset; its only boot-up message, within 1 s, is enough."""
+    rig = Rig(2, missing=(2,))
+    late = Device(PATTERN.copy_for_node(2, {0x607600: RATED}), 2, Application())
+    late.boot_at = late.wake_at = 700 * MS
+    rig.loop.connect(late, [rig.bus])
+    rig.run(800 * MS)
+    assert rig.master.state is MasterState.OPERATIONAL
+    assert rig.frames(0x702)[0] == b"\0"
+    assert rig.frames(0x702).count(b"\0") == 1
 
 
 def test_sync_lies_on_whole_cycles_and_counts() -> None:
@@ -205,18 +241,24 @@ def test_process_data_is_told_by_slave_and_number() -> None:
     assert {len(bytes(details[2])) for _, details in rig.application.of("pdo") if details[1] == 1} == {8}  # type: ignore[call-overload] # data
 
 
-def test_process_data_before_the_start_is_not_told() -> None:
+@pytest.mark.parametrize("when", [1 * MS, POWER_UP_NS, POWER_UP_NS + MS, POWER_UP_NS + 5 * MS])
+def test_process_data_before_the_start_is_not_told(when: int) -> None:
     """A device that talks out of turn is not yet configured."""
     rig = Rig(1)
-    rig.talker.say(1 * MS, Frame(0x181, bytes(8)))
-    rig.run(5 * MS)
+    rig.talker.say(when, Frame(0x181, bytes(8)))
+    rig.run(when + MS)
+    assert len(rig.ends(0x181)) == 1
+    assert rig.master.state in (MasterState.RESETTING, MasterState.BOOTING)
     assert rig.application.of("pdo") == []
 
 
 def test_master_sends_its_own_heartbeat() -> None:
-    """Node 127: boot-up at power-up, then every 100 ms, Operational."""
+    """Node 127: boot-up when it starts, then every 100 ms from there, Operational."""
     rig = Rig(1).run(1000 * MS)
     assert rig.frames(0x77F) == [b"\0"] + [b"\5"] * 9
+    for number, end in enumerate(rig.ends(0x77F)):
+        waits = end - (POWER_UP_NS + number * 100 * MS)
+        assert 55_000 <= waits <= CYCLE  # its own length at least; higher priorities before it
 
 
 def test_emergency_is_told_with_the_slave() -> None:
@@ -238,9 +280,9 @@ def test_master_that_hears_something_first_starts_all_the_same() -> None:
         def send(self, port: int, frame: Frame) -> None:
             pass
 
-    for can_id in (0x701, 0x081, 0x581, 0x181):
-        master.receive(0, 0, Frame(can_id, b"\0"), Sink())
-        assert master.wake_at == 0
+    for now, can_id in enumerate((0x701, 0x081, 0x581, 0x181)):
+        master.receive(now, 0, Frame(can_id, b"\0"), Sink())
+        assert (master.wake_at, master.state) == (POWER_UP_NS, MasterState.RESETTING)
 
 
 # --- a start that fails ------------------------------------------------------------------------------------------
@@ -268,21 +310,31 @@ def test_wrong_identity_names_node_found_and_expected() -> None:
 
 def test_missing_device_is_named_after_one_second() -> None:
     """No boot-up message within 1 s of reset communication, to the nanosecond."""
-    rig = Rig(3, missing=(2,)).run(SECOND - 1)
+    rig = Rig(3, missing=(2,)).run(POWER_UP_NS + SECOND - 1)
     assert rig.master.state is MasterState.BOOTING
-    now, text = failure_of(rig.run(SECOND))
-    assert now == SECOND
+    now, text = failure_of(rig.run(POWER_UP_NS + SECOND))
+    assert now == POWER_UP_NS + SECOND
     assert text == (
         "left_knee (node 2): no boot-up message within 1 s of reset communication; "
         "check power, wiring, bit rate and node id"
     )
 
 
+def test_boot_up_before_the_reset_does_not_count() -> None:
+    """A device that was there, heard 0x82 and did not come back is missing."""
+    rig = Rig(2, missing=(2,))
+    rig.loop.connect(BootOnly(2, 5 * MS), [rig.bus])
+    now, text = failure_of(rig.run(2 * SECOND))
+    assert len(rig.ends(0x702)) == 1
+    assert now == POWER_UP_NS + SECOND
+    assert text.startswith("left_knee (node 2): no boot-up message within 1 s of reset communication")
+
+
 def test_device_that_does_not_answer_is_named_after_half_a_second() -> None:
     """No SDO answer within 0.5 s of the request, and the transfer is aborted with 05040000."""
     rig = Rig(2, missing=(2,))
-    rig.loop.connect(BootOnly(2, 10 * MS), [rig.bus])
-    rig.run(20 * MS)
+    rig.loop.connect(BootOnly(2, POWER_UP_NS + 10 * MS), [rig.bus])
+    rig.run(POWER_UP_NS + 20 * MS)
     (booted,) = rig.ends(0x702)
     rig.run(booted + 500 * MS - 1)
     assert rig.master.state is MasterState.BOOTING
@@ -326,7 +378,7 @@ def test_abort_while_reading_names_the_object() -> None:
 def test_failed_master_leaves_the_bus_alone() -> None:
     """After a failure only its heartbeat goes on."""
     rig = Rig(2, missing=(2,)).run(3 * SECOND)
-    late = {row.frame.can_id for row in rig.loop.trace if row.end_ns > SECOND + MS}
+    late = {row.frame.can_id for row in rig.loop.trace if row.end_ns > POWER_UP_NS + SECOND + MS}
     assert late == {0x77F, 0x701}
     assert len(rig.application.of("failed")) == 1
 
@@ -334,20 +386,29 @@ def test_failed_master_leaves_the_bus_alone() -> None:
 # --- restarts ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("again", [5_500_000, 5_700_000, 6_000_000, 6_400_000])
-def test_second_boot_up_starts_the_sequence_of_that_device_over(again: int) -> None:
+@pytest.mark.parametrize("steps", [1, 2, 3, 4])
+def test_further_boot_up_starts_the_sequence_of_that_device_over(steps: int) -> None:
     """A device that resets during its configuration has forgotten all of it: from the first step again."""
     rig = Rig(6)
-    rig.talker.say(again, Frame(0x000, b"\x81\x02"))
+    rig.talker.say(Rig(6).run(100 * MS).ends(0x602)[steps - 1], Frame(0x000, b"\x81\x02"))
     rig.run(100 * MS)
     assert rig.master.state is MasterState.OPERATIONAL
-    assert rig.frames(0x702)[:2] == [b"\0", b"\0"]
+    assert rig.frames(0x702) == [b"\0", b"\0", b"\0"]  # power-up, reset communication, reset node
     requests = [data[:4].hex() for data in rig.frames(0x602)]
     whole = ["40001000", "40181002", "40766000", "23061000", "2b726000"]
     assert requests[-5:] == whole
-    assert requests[:-5] == whole[: len(requests) - 5]
+    assert requests[:-5] in (whole[:steps], whole[: steps + 1])  # the answer may have been on its way already
     assert rig.devices[2].od.value(0x607200) == 902
     assert rig.devices[2].nmt.state is NmtState.OPERATIONAL
+
+
+def test_device_that_resets_after_its_last_answer_is_told_to_have_rebooted() -> None:
+    """Then the start command passes it by; its boot-up message tells, and the application decides."""
+    rig = Rig(6)
+    rig.talker.say(Rig(6).run(100 * MS).ends(0x582)[4], Frame(0x000, b"\x81\x02"))
+    rig.run(100 * MS)
+    assert len(rig.frames(0x602)) == 5
+    assert [details for _, details in rig.application.of("rebooted")] == [(1,)]
 
 
 def test_boot_up_in_operation_is_told() -> None:
@@ -383,6 +444,48 @@ def test_heartbeat_that_comes_back_is_watched_again() -> None:
     assert [now for now, _ in rig.application.of("lost")][1:] == [back + HEARTBEAT_TIMEOUT]
 
 
+@pytest.mark.parametrize("silent", [1, 2, 3])
+def test_device_that_never_sends_a_heartbeat_is_missed_from_the_start_command_on(silent: int) -> None:
+    """CiA 301, 0x1016 begins with the first heartbeat; the master does not wait for one after the start."""
+    rig = Rig(3, more={silent: (Write(0x1017, 0, 0, 2),)}).run(SECOND)
+    (operational,) = [now for now, _ in rig.application.of("operational")]
+    assert rig.frames(0x700 + silent) == [b"\0", b"\0"]
+    assert rig.application.of("lost") == [(operational + HEARTBEAT_TIMEOUT, (silent - 1,))]
+
+
+@pytest.mark.parametrize(("command", "state"), [(0x80, 127), (0x02, 4)])
+def test_device_that_leaves_operational_is_told_by_its_heartbeat_once(command: int, state: int) -> None:
+    """CiA 301, 7.2.8.3.2.2: the state byte; told with the first heartbeat that has it, for that device alone."""
+    rig = Rig(3).run(250 * MS)
+    assert rig.application.of("left") == []
+    rig.talker.say(251 * MS, Frame(0x000, bytes((command, 2))))
+    rig.run(SECOND)
+    first = next(
+        row.end_ns for row in rig.loop.trace if row.frame.can_id == 0x702 and row.frame.data == bytes((state,))
+    )
+    assert rig.application.of("left") == [(first, (1, state))]
+    assert 251 * MS < first <= 251 * MS + 100 * MS + CYCLE
+    assert len(rig.frames(0x702)) > 8
+    assert rig.application.of("lost") == []
+
+
+def test_device_that_leaves_operational_again_is_told_again() -> None:
+    """Back in Operational by somebody's command, and out of it: an event of its own."""
+    rig = Rig(2).run(250 * MS)
+    for when, command in ((251, 0x80), (451, 0x01), (651, 0x02)):
+        rig.talker.say(when * MS, Frame(0x000, bytes((command, 2))))
+    rig.run(SECOND)
+    assert [details for _, details in rig.application.of("left")] == [(1, 127), (1, 4)]
+
+
+def test_states_before_the_start_are_nothing_to_tell() -> None:
+    """Devices beat Pre-operational while they are configured: they have left nothing."""
+    rig = Rig(2, missing=(2,)).run(900 * MS)  # waits for node 2 until 1.02 s
+    assert rig.master.state is MasterState.BOOTING
+    assert b"\x7f" in rig.frames(0x701)
+    assert rig.application.of("left") == []
+
+
 def test_cut_bus_loses_every_device() -> None:
     """All heartbeats end; the master goes on and does not hang."""
     rig = Rig(3).run(200 * MS)
@@ -392,15 +495,47 @@ def test_cut_bus_loses_every_device() -> None:
 
 
 def test_finished_application_ends_sync_and_operation() -> None:
-    """Leave: no more SYNC, all devices to Pre-operational."""
-    rig = Rig(2).run(100 * MS)
+    """Leave: NMT Pre-operational for all goes instead of the next SYNC, at its time, and no SYNC follows."""
+    rig = Rig(2).run(100 * MS + 300_000)
     rig.application.finished = True
+    syncs = len(rig.application.of("sync"))
     rig.run(SECOND)
     assert rig.master.state is MasterState.STOPPED
-    assert rig.ends(0x080)[-1] < 105 * MS
+    leave = rig.ends(0x000)[-1]
     assert rig.frames(0x000)[-1] == b"\x80\0"
+    assert leave == 102 * MS + Frame(0x000, b"\x80\0").measure() * 1000  # on a bus that is idle then
+    assert 100 * MS < rig.ends(0x080)[-1] < leave
+    assert len(rig.application.of("sync")) == syncs
     assert {device.nmt.state for device in rig.devices.values()} == {NmtState.PRE_OPERATIONAL}
     assert rig.ends(0x181)[-1] < 105 * MS
+
+
+@pytest.mark.parametrize("delay", [1, 20_000, 60_000])
+def test_no_sync_follows_the_end_however_soon_another_timer_is_due(delay: int) -> None:
+    """An application that finishes with a SYNC still queued: NMT (id 0) must not overtake it at some other wake-up."""
+
+    class Leaver(Recorder):
+        def synchronised(self, now: int, out: Out) -> None:
+            super().synchronised(now, out)
+            if now >= 60 * MS:
+                self.finished = True
+                self.wake_at = now + delay
+
+        def wake(self, now: int, out: Out) -> None:
+            self.wake_at = NEVER
+
+    master = Master(plan_of(1), (slave("left_hip", 1),), Leaver())
+    loop = Loop([Medium("bus", 0, 1_000_000)])
+    talker = Talker()
+    for node in (master, talker, Device(PATTERN.copy_for_node(1, {0x607600: RATED}), 1, Application())):
+        loop.connect(node, loop.media)
+    talker.say(60 * MS - 1, Frame(0x7F0, bytes(8)))  # on the bus when SYNC is queued
+    loop.run_until(200 * MS)
+    assert master.state is MasterState.STOPPED
+    ids = [row.frame.can_id for row in loop.trace]
+    leave = max(at for at, can_id in enumerate(ids) if can_id == 0x000)
+    assert 0x080 in ids
+    assert 0x080 not in ids[leave:]
 
 
 def test_application_has_a_timer_of_its_own() -> None:
@@ -453,9 +588,12 @@ class Sink(Out):
 
 
 @settings(max_examples=200)
-@given(noise=st.lists(st.tuples(st.sampled_from([0, 1, 100_000, CYCLE, 400 * MS]), NOISE), max_size=30))
-def test_no_frames_make_the_master_raise(noise: list[tuple[int, tuple[int, bytes, int]]]) -> None:
-    """Any bytes on any id while booting: no exception, and wake_at always moves on."""
+@given(
+    noise=st.lists(st.tuples(st.sampled_from([0, 1, 100_000, CYCLE, 400 * MS]), NOISE), max_size=30),
+    begin=st.sampled_from([0, POWER_UP_NS]),
+)
+def test_no_frames_make_the_master_raise(noise: list[tuple[int, tuple[int, bytes, int]]], begin: int) -> None:
+    """Any bytes on any id while waiting or booting: no exception, and wake_at always moves on."""
     application, out = Recorder(), Sink()
     master = Master(plan_of(2), (slave("left_hip", 1), slave("left_knee", 2)), application)
 
@@ -465,7 +603,7 @@ def test_no_frames_make_the_master_raise(noise: list[tuple[int, tuple[int, bytes
             master.wake(now, out)
             assert master.wake_at > now
 
-    now = 0
+    now = begin
     serve(now)
     for gap, (can_id, data, flags) in noise:
         now += gap

@@ -353,7 +353,8 @@ def test_canopen_package_makes_the_drive_push(pdos: bool) -> None:
 
 
 def test_canopen_package_resets_a_fault() -> None:
-    """Heartbeat lost with 6007 = 1: Fault; the master's own sequence resets it on the edge and enables again."""
+    """Heartbeat lost with 6007 = 1: Fault, which no reset ends while the heartbeat is lost; when it is back, the
+    master's own sequence resets it on the edge and enables again."""
     bus, drive, node = drive_rig(False)
     node.sdo["Abort connection option code"].raw = 1
     node.sdo[0x1016][1].raw = 127 << 16 | 50
@@ -364,6 +365,11 @@ def test_canopen_package_resets_a_fault() -> None:
     assert node.sdo["Error code"].raw == 0x8130
     assert drive.torque_nm == 0.0
     node.TIMEOUT_RESET_FAULT = 0.0  # it would wait for a reset that only its next step commands
+    for controlword in (State402.CW_DISABLE_VOLTAGE, 0x80, State402.CW_DISABLE_VOLTAGE):
+        node.controlword = controlword
+        assert (node.state, node.sdo["Error code"].raw, node.sdo["Error register"].raw) == ("FAULT", 0x8130, 0x11)
+    bus.network.send_message(0x77F, b"\5")
+    assert (node.state, node.sdo["Error code"].raw, node.sdo["Error register"].raw) == ("FAULT", 0x8130, 0)
     node.reset_from_fault()
     assert node.state == "OPERATION ENABLED"
     assert node.sdo["Error code"].raw == 0

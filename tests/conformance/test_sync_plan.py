@@ -14,6 +14,7 @@ from cantools.database.can import Database
 
 from canopen_exo.bus.medium import Transmission
 from canopen_exo.bus.node import MS, SECOND
+from canopen_exo.master import POWER_UP_NS
 from canopen_exo.plan import BusPlan
 from hlc.node import Phase
 from testbench.rig import CONTROLLER_BUS, DRIVE_BUS, Rig, RigParams, build_rig
@@ -84,9 +85,9 @@ def test_frames_of_the_motion_are_those_of_the_plan_and_no_others(motion: Motion
 
 
 def heartbeat_clock(rig: Rig, node: int) -> int:
-    """When a producer's period began: with the write to 0x1017 for a drive, with power-up for the master (127)."""
+    """When a producer's period began: with the write to 0x1017 for a drive, with its start for the master (127)."""
     if node == 127:
-        return 0
+        return POWER_UP_NS
     for row in rig.loop.trace:
         frame = row.frame
         if row.bus == DRIVE_BUS and frame.can_id == 0x600 + node and frame.data[1:4] == b"\x17\x10\x00":
@@ -241,7 +242,8 @@ def test_store_and_forward_costs_at_least_the_frame_itself(rig: Rig) -> None:
 
 
 def test_start_follows_the_standards_order(rig: Rig) -> None:
-    """CiA 302-2: reset communication, boot-up of all, SDO, start; only then SYNC and PDOs, only then time 0."""
+    """CiA 302-2: all booted, reset communication, boot-up of all again, SDO, start; only then SYNC and PDOs, then time
+    0; at the end Pre-operational, and no SYNC after it."""
     rows = [row for row in rig.loop.trace if row.bus == DRIVE_BUS]
     first: dict[str, int] = {}
     last: dict[str, int] = {}
@@ -255,12 +257,43 @@ def test_start_follows_the_standards_order(rig: Rig) -> None:
             what = kinds.get(can_id & 0x780, "other")
         first.setdefault(what, at)
         last[what] = at
-    assert first["nmt 82"] == 0
+    boot_ups = [(at, row.frame.can_id) for at, row in enumerate(rows) if row.frame.data == b"\x00"]
+    before = [can_id for at, can_id in boot_ups if at < first["nmt 82"]]
+    after = [can_id for at, can_id in boot_ups if at > first["nmt 82"]]
+    drives = list(range(0x701, 0x707))
+    assert sorted(before) == drives  # powered up with the master, they hear the reset
+    assert sorted(after) == [*drives, MASTER_HEARTBEAT]  # and each of them serves it
+    assert first["nmt 82"] == last["nmt 82"] == 6
     assert last["boot-up"] < first["nmt 01"]
-    assert first["boot-up"] < first["sdo"]
+    for node in NODES:
+        again = next(at for at, can_id in boot_ups if at > first["nmt 82"] and can_id == 0x700 + node)
+        assert again < next(at for at, row in enumerate(rows) if row.frame.can_id == 0x600 + node)
     assert last["sdo"] < first["nmt 01"] < first["sync"] < first["tpdo"] < first["rpdo"] < first["status"]
-    boot_ups = sorted(row.frame.can_id for row in rows if row.frame.data == b"\x00")
-    assert boot_ups == [*range(0x701, 0x707), MASTER_HEARTBEAT]
+    assert max(last["sync"], last["rpdo"], last["status"]) < first["nmt 80"]
+    assert len({row.frame.can_id for row in rows[first["nmt 80"] :]} - {0x000, MASTER_HEARTBEAT, *drives}) == 0
+
+
+@pytest.mark.parametrize("node", NODES)
+def test_master_writes_every_pdo_of_the_plan_by_the_standard_procedure(rig: Rig, node: int) -> None:
+    """CiA 301, 7.5.2.36 and .38: not valid, parameters, no entries, entries, their number, valid; numbers by hand."""
+    writes = []
+    for row in rig.loop.trace:
+        frame = row.frame
+        if row.bus == DRIVE_BUS and frame.can_id == 0x600 + node and frame.data[0] & 0xF3 == 0x23:
+            index, sub = struct.unpack("<HB", frame.data[1:4])
+            size = 4 - (frame.data[0] >> 2 & 3)
+            if 0x1400 <= index < 0x1C00:
+                writes.append((index, sub, int.from_bytes(frame.data[4 : 4 + size], "little"), size))
+    off = 1 << 31
+    assert writes == [
+        (0x1400, 1, off | 0x200 + node, 4), (0x1400, 2, 1, 1), (0x1400, 5, 20, 2), (0x1600, 0, 0, 1),
+        (0x1600, 1, 0x60400010, 4), (0x1600, 2, 0x60710010, 4), (0x1600, 0, 2, 1), (0x1400, 1, 0x200 + node, 4),
+        (0x1800, 1, off | 0x180 + node, 4), (0x1800, 2, 1, 1), (0x1800, 6, 0, 1), (0x1A00, 0, 0, 1),
+        (0x1A00, 1, 0x60640020, 4), (0x1A00, 2, 0x606C0020, 4), (0x1A00, 0, 2, 1), (0x1800, 1, 0x180 + node, 4),
+        (0x1801, 1, off | 0x280 + node, 4), (0x1801, 2, 10, 1), (0x1801, 6, node, 1), (0x1A01, 0, 0, 1),
+        (0x1A01, 1, 0x60410010, 4), (0x1A01, 2, 0x60770010, 4), (0x1A01, 3, 0x603F0010, 4), (0x1A01, 0, 3, 1),
+        (0x1801, 1, 0x280 + node, 4),
+    ]  # fmt: skip
 
 
 def test_no_emcy_in_a_fault_free_run(rig: Rig) -> None:

@@ -334,6 +334,14 @@ def test_no_fault_raises_or_changes_length_or_id(make: Callable[[], Fault], last
 
 
 @pytest.mark.parametrize("make", EVERY)
+def test_only_a_drop_gives_back_a_frame_that_it_left_alone(make: Callable[[], Fault]) -> None:
+    """faults.md: injected counts frames acted on: for a drop the same frame means spared, for others the same value."""
+    fault: Fault = make()
+    assert fault.spares == isinstance(fault, Drop)
+    assert copy.deepcopy(fault).spares == fault.spares
+
+
+@pytest.mark.parametrize("make", EVERY)
 def test_a_copy_in_mid_activation_goes_on_identically(make: Callable[[], Fault]) -> None:
     """Snapshots: deepcopy and pickle keep held values, drawn bits and the stream."""
     fault: Fault = make()

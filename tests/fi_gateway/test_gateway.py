@@ -3,6 +3,7 @@
 import copy
 import pickle
 import struct
+from collections.abc import Callable
 
 import pytest
 from hypothesis import given, settings
@@ -514,6 +515,113 @@ def test_finish_closes_every_window_and_then_passes_frames() -> None:
     assert gateway.wake_at == NEVER
 
 
+STOPPED = status(3, 0)
+
+
+def test_the_end_of_the_motion_ends_every_injection() -> None:
+    """design.md: faults belong to the motion: with the controller's status STOPPED open windows end, no other opens."""
+    parts = [
+        injector(Drop(), At((0,)), Infinite(), "infinite", target=Target(True, False, (0x186,))),
+        injector(Bias(POSITION, 1), At((50,)), ConstantTime(1000), "cut"),
+        injector(Bias(POSITION, 2), At((10, 100)), ConstantTime(20), "over and due"),
+        injector(Bias(POSITION, 4), At((200,)), ConstantTime(100), "late"),
+        injector(StuckAt(VELOCITY), At((0,)), Infinite(), "waiting"),
+        injector(Drop(), At((60,)), Once(), "once", target=Target(True, False, (0x187,))),
+    ]
+    gateway, sink = at(ZERO, parts)
+    assert pass_through(gateway, ZERO + 99, Frame(0x186, b"")) is None
+    gateway.receive(ZERO + 100, CONTROLLER_PORT, STOPPED, sink)
+    assert sink.sent == [(DRIVE_PORT, STOPPED)]
+    assert gateway.wake_at == NEVER
+    for now in (100, 101, 200, 250, SECOND):
+        for frame in (joint(1, 2), Frame(0x186, b""), Frame(0x187, b"")):
+            assert pass_through(gateway, ZERO + now, frame) is frame
+    found = [(r.injector, r.start_ns - ZERO, r.end_ns) for r in gateway.records]
+    assert found == [
+        ("infinite", 0, NEVER),  # its effect had no end
+        ("over and due", 10, ZERO + 30),
+        ("cut", 50, ZERO + 100),
+        ("once", 60, ZERO + 100),
+    ]
+    gateway.finish(ZERO + SECOND)
+    assert [(r.injector, r.start_ns - ZERO, r.end_ns) for r in gateway.records] == found
+
+
+@pytest.mark.parametrize(("offset", "inside"), [(-1, True), (0, False), (1, False)])
+def test_an_injection_that_the_stop_ends_is_half_open_too(offset: int, inside: bool) -> None:
+    """faults.md: window [t0, t0 + D): the instant of the status frame is the first outside."""
+    gateway, sink = at(ZERO, [injector(Drop(), At((0,)), ConstantTime(SECOND))])
+    if not inside:
+        gateway.receive(ZERO + 100, CONTROLLER_PORT, STOPPED, sink)
+    frame = joint(1, 2)
+    assert pass_through(gateway, ZERO + 100 + offset, frame) is (None if inside else frame)
+
+
+def test_injectors_that_count_from_power_up_outlast_the_motion() -> None:
+    """`from: power_up` is for what happens around the motion: its windows go on, and others open."""
+    parts = [
+        injector(Drop(), At((0, 500 * MS)), ConstantTime(300 * MS), "boot", from_power_up=True),
+        injector(Bias(POSITION, 1), Never(), Infinite(), "motion", Trigger(("boot",))),
+    ]
+    gateway, sink = at(ZERO, parts)  # its first frame, at ZERO, is power-up here
+    gateway.receive(ZERO + 200 * MS, CONTROLLER_PORT, STOPPED, sink)
+    out = [pass_through(gateway, ZERO + now * MS, joint(1, 2)) for now in (200, 299, 300, 499, 500, 799, 800)]
+    assert [frame is None for frame in out] == [True, True, False, False, True, True, False]
+    assert [values(frame) for frame in out if frame is not None] == [(1, 2)] * 3  # and it triggers nothing any more
+    assert [(r.injector, r.start_ns - ZERO) for r in gateway.records] == [("boot", 0), ("boot", 500 * MS)]
+
+
+@pytest.mark.parametrize(
+    ("port", "frame", "malformed"),
+    [
+        (CONTROLLER_PORT, status(2, 10), 0),
+        (CONTROLLER_PORT, status(1, 0), 0),
+        (CONTROLLER_PORT, status(0, 0), 0),
+        (CONTROLLER_PORT, status(4, 0), 0),
+        (DRIVE_PORT, STOPPED, 0),
+        (CONTROLLER_PORT, Frame(0x2FF, b"\x03\x00"), 1),
+        (CONTROLLER_PORT, Frame(0x2FF, b"\x03\x00\x00\x00\x00", FLAG_EXTENDED), 0),
+        (CONTROLLER_PORT, Frame(0x2FE, STOPPED.data), 0),
+    ],
+)
+def test_nothing_else_ends_the_injection(port: int, frame: Frame, malformed: int) -> None:
+    """Starting, motion, unknown states, the wrong side, too short, another format, another id."""
+    gateway, sink = at(ZERO, [injector(Drop(), At((0,)), Infinite())])
+    gateway.receive(ZERO + 100, port, frame, sink)
+    assert pass_through(gateway, ZERO + 101, joint(1, 2)) is None
+    assert gateway.malformed == malformed
+
+
+def test_the_gateway_reads_the_end_before_any_fault() -> None:
+    """As received: an injector that drops the status frame does not blind the gateway; this one it still loses not."""
+    target = Target(False, True, (0x2FF,))
+    gateway, _ = at(ZERO, [injector(Drop(), At((0,)), Infinite(), target=target)])
+    assert pass_through(gateway, ZERO + 50, status(2, 10), CONTROLLER_PORT) is None
+    assert pass_through(gateway, ZERO + 100, STOPPED, CONTROLLER_PORT) is STOPPED
+
+
+def test_a_motion_that_begins_again_is_not_injected() -> None:
+    """One motion a run: time 0 stays, and spent injectors stay spent."""
+    gateway, sink = at(ZERO, [injector(Drop(), At((0, SECOND)), ConstantTime(100 * MS))])
+    gateway.receive(ZERO + 50 * MS, CONTROLLER_PORT, STOPPED, sink)
+    gateway.receive(ZERO + SECOND - CYCLE, CONTROLLER_PORT, Frame(0x080, b"\x01"), sink)
+    gateway.receive(ZERO + SECOND - CYCLE, CONTROLLER_PORT, status(2, 0), sink)
+    frame = joint(1, 2)
+    assert pass_through(gateway, ZERO + SECOND + 1, frame) is frame
+    assert gateway.time_zero == ZERO
+
+
+@pytest.mark.parametrize("copier", [copy.deepcopy, lambda gateway: pickle.loads(pickle.dumps(gateway))])
+def test_a_copy_of_a_stopped_gateway_stays_stopped(copier: Callable[[Gateway], Gateway]) -> None:
+    """Snapshots after the motion: nothing opens again."""
+    gateway, sink = at(ZERO, [injector(Drop(), At((0, SECOND)), ConstantTime(100 * MS))])
+    gateway.receive(ZERO + 50 * MS, CONTROLLER_PORT, STOPPED, sink)
+    twin = copier(gateway)
+    frame = joint(1, 2)
+    assert pass_through(twin, ZERO + SECOND + 1, frame) is frame
+    assert facts(twin) == facts(gateway)
+
+
 def activations(probability: float, duration: int, until: int, seed: int) -> int:
     rng = stream(seed, 0, "x")
     event = FailureProbability(probability, MS, rng)
@@ -618,6 +726,7 @@ frames = st.one_of(
     st.builds(Frame, st.integers(0, 0x1FFFFFFF), st.binary(max_size=8), st.just(FLAG_EXTENDED)),
     st.builds(Frame, st.sampled_from([0x080, 0x185, 0x2FF]), st.just(b""), st.just(FLAG_REMOTE), st.integers(0, 15)),
     st.builds(lambda: status(2, 0)),
+    st.builds(lambda: status(3, 0)),
 )
 
 

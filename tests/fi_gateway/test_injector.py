@@ -131,6 +131,81 @@ def test_a_lost_frame_has_no_after() -> None:
     assert (record.first_before, record.first_after, record.frames_changed, record.signal) == (word(7), None, 1, "")
 
 
+@pytest.mark.parametrize(("probability", "injected"), [(0.0, 0), (1.0, 50)])
+def test_a_frame_that_a_drop_spares_is_seen_and_not_injected(probability: float, injected: int) -> None:
+    """faults.md: injected = frames the fault acted on; losing none of 50 is no injection."""
+    one = injector(fault=Drop(probability))
+    one.start(0)
+    record = one.open(10, "event")
+    assert record is not None
+    for n in range(50):
+        assert (one.act(10 + n, word(n)) is None) == bool(injected)
+    assert (record.frames_seen, record.frames_injected, record.frames_changed) == (50, injected, injected)
+    assert (one.injected, one.manifested) == (injected, injected)
+
+
+def test_a_drop_by_chance_injects_exactly_the_frames_it_loses() -> None:
+    """Counted one by one, in the injector and in its record."""
+    one = injector(fault=Drop(0.4), effect=Infinite())
+    one.start(0)
+    record = one.open(10, "event")
+    assert record is not None
+    lost = sum(one.act(10 + n, word(n)) is None for n in range(200))
+    assert 0 < lost < 200
+    assert (record.frames_seen, record.frames_injected, record.frames_changed) == (200, lost, lost)
+    assert (one.injected, one.manifested) == (lost, lost)
+
+
+def test_a_value_that_is_replaced_by_itself_is_injected_and_not_manifested() -> None:
+    """Unlike a spared frame: the fault acted, the result is the same."""
+    one = injector(fault=StuckAtValue(WORD, 7))
+    one.start(0)
+    record = one.open(10, "event")
+    assert record is not None
+    for n in range(3):
+        one.act(20 + n, word(7))
+    assert (record.frames_seen, record.frames_injected, record.frames_changed) == (3, 3, 0)
+
+
+def test_record_of_whole_frames_has_the_name_of_the_target() -> None:
+    """A target without a signal is named too: "right_knee.TPDO1"; a signal keeps its own name."""
+    for fault, expected in ((Drop(), "left_hip.TPDO2"), (StuckAtValue(WORD, 0), "left_hip.statusword")):
+        target = Target(True, False, (0x281,), "left_hip.TPDO2")
+        one = Injector("x", target, fault, At((10,)), Infinite(), None, stream(1, 0, "x"))
+        for each in (one, copy.deepcopy(one)):
+            each.start(0)
+            record = each.open(10, "event")
+            assert record is not None
+            assert record.signal == expected
+
+
+@pytest.mark.parametrize(
+    ("effect", "end"), [(ConstantTime(100), 30), (ConstantTime(15), 25), (Once(), 30), (Infinite(), NEVER)]
+)
+def test_stop_ends_the_window_but_does_not_invent_an_end_for_infinite(effect: Effect, end: int) -> None:
+    """The record's end: as planned when that was before, the stop, or none for an effect without limit."""
+    one = injector(effect=effect, event=At((10, 500)))
+    one.start(0)
+    record = one.open(10, "event")
+    assert record is not None
+    if end < 30:
+        one.close(one.next_ns)
+    one.stop(30)
+    one.stop(40)
+    assert (phase(one), one.next_ns, record.end_ns) == (Phase.SPENT, NEVER, end)
+    same = word(5)
+    assert one.act(31, same) is same
+
+
+def test_stop_of_an_injector_that_waits_leaves_no_record() -> None:
+    """It was never active."""
+    one = injector(fault=StuckAt(WORD))
+    one.start(0)
+    assert one.open(10, "event") is None
+    one.stop(30)
+    assert (phase(one), one.activated) == (Phase.SPENT, 0)
+
+
 def test_record_names_signal_cause_and_times() -> None:
     """Recorded per activation: sampled times, cause, signal."""
     one = injector("freeze")

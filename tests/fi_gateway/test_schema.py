@@ -101,6 +101,24 @@ def test_a_fault_in_a_file_does_what_it_says(fault: str, target: str, data: str,
     assert outcome(fault, target, bytes.fromhex(data)) == bytes.fromhex(result)
 
 
+@pytest.mark.parametrize(
+    ("fault", "target", "name"),
+    [
+        ("{type: drop}", TPDO1, "right_knee.TPDO1"),
+        ("{type: drop}", "{bus: to_drives, cob_id: 0x80}", "SYNC 0x080"),
+        ("{type: drop}", "{bus: to_controller, pdo: TPDO1}", "TPDO1 0x181..0x186"),
+        ("{type: stuck_at_value, value: 1 counts}", POSITION, "right_knee.position"),
+    ],
+)
+def test_records_name_what_the_file_targets(fault: str, target: str, name: str) -> None:
+    """An activation says what was hit, whole frames as well as signals."""
+    one = build_injectors(read(a=injector(fault, target)), PLAN, 1, 0)[0]
+    one.start(0)
+    record = one.open(0, "test")
+    assert record is not None
+    assert record.signal == name
+
+
 def test_a_plain_number_sets_a_signal_without_unit() -> None:
     """statusword has no unit: 0x27 is a plain number."""
     target = "{bus: to_controller, node: right_knee, signal: statusword}"

@@ -80,6 +80,29 @@ def test_without_a_signal_the_target_is_the_whole_frame(text: str, cob_ids: tupl
 
 
 @pytest.mark.parametrize(
+    ("text", "name"),
+    [
+        ("bus: to_controller, node: right_knee, pdo: TPDO1", "right_knee.TPDO1"),
+        ("bus: to_controller, cob_id: 0x185", "right_knee.TPDO1"),
+        ("bus: to_drives, node: left_hip, pdo: RPDO1", "left_hip.RPDO1"),
+        ("bus: to_controller, node: right_knee, signal: position", "right_knee.position"),
+        ("bus: to_controller, pdo: TPDO1", "TPDO1 0x181..0x186"),
+        ("bus: to_controller, cob_id: 0x705", "right_knee.heartbeat"),
+        ("bus: to_controller, cob_id: 0x85", "right_knee.EMCY"),
+        ("bus: to_drives, cob_id: 0x605", "right_knee.SDO request"),
+        ("bus: to_drives, cob_id: 0x80", "SYNC 0x080"),
+        ("bus: to_drives, cob_id: 0", "NMT 0x000"),
+        ("bus: to_drives, cob_id: 0x2FF", "HLC status 0x2FF"),
+        ("bus: to_drives, cob_id: 0x77F", "controller.heartbeat"),
+        ("bus: both, cob_id: 0x7FF", "frames 0x7FF"),
+    ],
+)
+def test_every_target_has_a_name_for_records(text: str, name: str) -> None:
+    """Owner and what it sends; frames of nobody or of many with their COB-IDs."""
+    assert place(text).name == name
+
+
+@pytest.mark.parametrize(
     ("bus", "directions"), [("to_controller", (True, False)), ("both", (True, True))]
 )
 def test_the_bus_is_a_direction_of_travel(bus: str, directions: tuple[bool, bool]) -> None:

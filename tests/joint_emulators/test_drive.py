@@ -413,6 +413,69 @@ def test_sync_that_comes_back_is_told_at_once() -> None:
     assert joint.read(0x1001) == 0
 
 
+def find_sync(joint: Joint) -> None:
+    joint.sync()
+
+
+def find_rpdo(joint: Joint) -> None:
+    joint.rpdo(0x00)
+
+
+def find_heartbeat(joint: Joint) -> None:
+    joint.hear(0x77F, b"\x05")
+
+
+FOUND = [(lose_sync, find_sync), (lose_rpdo, find_rpdo), (lose_heartbeat, find_heartbeat)]
+
+
+@pytest.mark.parametrize(("lose", "find"), FOUND)
+@pytest.mark.parametrize("option", [0, 2, 3])
+def test_error_code_is_clear_again_when_the_last_error_is_gone(
+    lose: Callable[[Joint], None], find: Callable[[Joint], None], option: int
+) -> None:
+    """0x603F tells of an error that is there: without Fault it goes with the error, as 0x1001 and EMCY 0000 do."""
+    joint = supervised(option)
+    lose(joint)
+    assert joint.read(0x603F) != 0
+    find(joint)
+    assert (joint.read(0x1001), joint.read(0x603F)) == (0, 0)
+
+
+def test_error_code_stays_while_another_error_lasts() -> None:
+    """SYNC and RPDO lost, RPDO back: something is still wrong, and 0x603F is not 0 before SYNC is back too."""
+    joint = supervised(2)
+    lose_sync(joint)
+    joint.pass_time(10 * MS)
+    assert joint.read(0x603F) == RPDO_LATE
+    joint.rpdo(0x00)
+    assert joint.read(0x1001) == 0x11
+    assert joint.read(0x603F) != 0
+    joint.sync()
+    assert (joint.read(0x1001), joint.read(0x603F)) == (0, 0)
+
+
+def test_error_code_is_clear_after_reset_communication() -> None:
+    """NMT reset communication forgets all errors; what 0x603F said of them goes with them."""
+    joint = supervised(2)
+    lose_sync(joint)
+    joint.nmt(0x82)
+    joint.pass_time(10 * MS)
+    assert (joint.state, joint.read(0x1001), joint.read(0x603F)) == (DISABLED, 0, 0)
+
+
+def test_error_code_in_tpdo2_goes_with_the_error() -> None:
+    """What the master sees without asking: 8700 is gone from TPDO2 with the SYNC that ends it."""
+    joint = supervised(2)
+    joint.write(0x1801, 1 << 31 | 0x280 + NODE, 4, sub=1)
+    joint.write(0x1801, 1, 1, sub=2)
+    joint.write(0x1801, 0, 1, sub=6)
+    assert joint.write(0x1801, 0x280 + NODE, 4, sub=1) == 0
+    lose_sync(joint)
+    assert joint.read(0x603F) == SYNC_LOST
+    (frame,) = [frame for frame in joint.sync() if frame.can_id == 0x280 + NODE]
+    assert struct.unpack("<HhH", frame.data)[2] == 0
+
+
 def test_unwatched_connection_does_not_end_by_silence(enabled: Joint) -> None:
     """1006 = 0, 1400:5 = 0, 1016 unused: nothing is watched, the last command stands."""
     enabled.pass_time(1000 * MS)
@@ -458,6 +521,62 @@ def test_fault_is_left_on_the_rising_edge_of_bit_7(word: int) -> None:
     joint = in_fault()
     joint.command(word, torque=500)
     assert (joint.state, joint.read(0x603F), joint.drive.torque_nm) == (DISABLED, 0, 0.0)
+
+
+@pytest.mark.parametrize(("lose", "find"), FOUND)
+@pytest.mark.parametrize("word", [0x80, 0x8F, 0x86])
+def test_fault_reset_is_refused_while_its_cause_lasts(
+    lose: Callable[[Joint], None], find: Callable[[Joint], None], word: int
+) -> None:
+    """CiA 402-2, transition 15: only when the fault is no longer there (0x1001 = 0); its code stays until then."""
+    joint = supervised(1)
+    lose(joint)
+    code = joint.read(0x603F)
+    for controlword in (word, 0x00, word):
+        joint.write(0x6040, controlword, 2)
+        assert (joint.state, joint.read(0x603F), joint.read(0x1001)) == (FAULT, code, 0x11)
+    joint.write(0x6040, 0x00, 2)
+    find(joint)
+    assert (joint.state, joint.read(0x603F), joint.read(0x1001)) == (FAULT, code, 0)  # the fault waits for its reset
+    joint.write(0x6040, word, 2)
+    assert (joint.state, joint.read(0x603F)) == (DISABLED, 0)
+
+
+def test_fault_reset_that_is_held_acts_when_the_cause_is_gone() -> None:
+    """A master that asks in every cycle need not take the bit back: the refused edge counts once nothing is wrong."""
+    joint = supervised(1)
+    lose_heartbeat(joint)
+    joint.command(0x80, 0x80, 0x80)
+    assert (joint.state, joint.read(0x603F)) == (FAULT, HEARTBEAT_LOST)
+    joint.hear(0x77F, b"\x05")
+    assert joint.state == FAULT
+    joint.command(0x80)
+    assert (joint.state, joint.read(0x603F)) == (DISABLED, 0)
+
+
+def test_bit_7_set_before_the_fault_does_not_reset_it_when_the_cause_is_gone() -> None:
+    """An edge, not a level, while the error lasts as well."""
+    joint = supervised(1)
+    joint.command(0x8F, torque=500)
+    joint.hear(0x77F, b"\x05")
+    for _ in range(150):
+        joint.command(0x8F, torque=500)
+    assert (joint.state, joint.read(0x603F)) == (FAULT, HEARTBEAT_LOST)
+    joint.hear(0x77F, b"\x05")
+    joint.command(0x8F, 0x8F, torque=500)
+    assert joint.state == FAULT
+    joint.command(0x0F, 0x8F)
+    assert joint.state == DISABLED
+
+
+def test_fault_and_its_code_survive_reset_communication() -> None:
+    """Reset communication is no fault reset: the application goes on as it was; then the reset is not refused."""
+    joint = in_fault()
+    joint.nmt(0x82)
+    joint.pass_time(10 * MS)
+    assert (joint.state, joint.read(0x1001), joint.read(0x603F)) == (FAULT, 0, SYNC_LOST)
+    joint.write(0x6040, 0x80, 2)
+    assert (joint.state, joint.read(0x603F)) == (DISABLED, 0)
 
 
 @pytest.mark.parametrize("words", [(0x00,), (0x06,), (0x06, 0x07, 0x0F), (0x0F,)])

@@ -347,6 +347,23 @@ def test_heartbeat_of_the_master_reaches_the_drives_that_watch_it(bench: Bench) 
     assert errors == [(5, Frame(0x086, struct.pack("<HB5x", 0x8130, 0x11)))]
 
 
+def test_error_of_one_drive_is_its_own_and_ends_with_its_cause(bench: Bench) -> None:
+    """EMCY, 0x603F and the torque that drops are node 6's; the heartbeat that is back ends the error there."""
+    torques = (100, 200, 300, -100, -200, -300)
+    bench.start()
+    bench.write(20 * MS + 1, 6, 0x1016, 1, 127 << 16 | 50, 4)
+    last = bench.enable(torques)
+    bench.hear(last, 0x77F, b"\x05")
+    bench.run(last + 50 * MS)
+    assert bench.torques() == pytest.approx([*[raw * NM for raw in torques[:5]], 0.0])
+    codes = [device.od.values[key_of(0x603F, 0)] for device in bench.rack.devices]
+    assert codes == [0, 0, 0, 0, 0, 0x8130]
+    answers = bench.hear(last + 60 * MS, 0x77F, b"\x05")
+    assert answers == [(5, Frame(0x086, bytes(8)))]
+    assert [device.od.values[key_of(0x603F, 0)] for device in bench.rack.devices] == [0] * 6
+    assert bench.torques() == pytest.approx([*[raw * NM for raw in torques[:5]], 0.0])  # not by itself
+
+
 @pytest.mark.parametrize(
     ("can_id", "flags"), [(0x201, FLAG_EXTENDED), (0x201 << 18, FLAG_EXTENDED), (0x201, FLAG_REMOTE)]
 )

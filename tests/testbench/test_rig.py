@@ -1,6 +1,7 @@
 """The whole rig: a fault-free walk inside every limit, cut cables, lost samples, a restarting drive, copies."""
 
 import copy
+import dataclasses
 import math
 
 import numpy as np
@@ -9,8 +10,19 @@ import pytest
 from canopen_exo.bus.frame import Frame
 from canopen_exo.bus.medium import Medium, Transmission
 from canopen_exo.bus.node import MS, NEVER, SECOND, Node, Out
+from canopen_exo.master import POWER_UP_NS
 from canopen_exo.nmt import NmtState
-from canopen_exo.plan import BusPlan
+from canopen_exo.plan import (
+    CONTROLWORD,
+    ERROR_CODE,
+    POSITION,
+    STATUSWORD,
+    TARGET_TORQUE,
+    TORQUE,
+    VELOCITY,
+    BusPlan,
+    Pdo,
+)
 from canopen_exo.signal import Signal
 from fi_gateway.effects import ConstantTime
 from fi_gateway.events import At, FailureProbability
@@ -19,8 +31,11 @@ from fi_gateway.injector import Injector, Target, stream
 from hlc.limits import limits_of
 from hlc.node import Phase
 from joint_emulators.plant import Plant
+from testbench.record import RunRecord
 from testbench.rig import CONTROLLER_BUS, DRIVE_BUS, Rig, RigParams, build_rig
+from testbench.run import NotStartedError, drive_through, record_of, run_rig
 from testbench.scenario import default_joints
+from testbench.verdict import judge
 
 pytestmark = pytest.mark.run
 
@@ -35,7 +50,7 @@ KNEE_POSITION: Signal = next(
 )
 
 SYNC_LOST, RPDO_LATE, HEARTBEAT_LOST = 0x8700, 0x8250, 0x8130
-STATUSWORD, ERROR_CODE = 0x6041 << 8, 0x603F << 8
+STATUSWORD_KEY, ERROR_CODE_KEY = 0x6041 << 8, 0x603F << 8
 SWITCH_ON_DISABLED = 0x0250
 """Statusword: Switch on disabled, voltage present, remote."""
 
@@ -67,16 +82,31 @@ def injector(fault: Fault, at_ns: int, duration_ns: int, cob_id: int) -> Injecto
     return Injector("x", target, fault, At((at_ns,)), ConstantTime(duration_ns), None, stream(1, 0, "x"), True, False)
 
 
+def dropped(
+    cob_id: int,
+    at_ns: int,
+    duration_ns: int,
+    *,
+    to_drives: bool = True,
+    name: str = "drop",
+    from_power_up: bool = False,
+) -> Injector:
+    """Loses every frame of an id in one direction for a time."""
+    target = Target(not to_drives, to_drives, (cob_id,), "SYNC 0x080" if cob_id == 0x080 else "")
+    effect = ConstantTime(duration_ns)
+    return Injector(name, target, Drop(), At((at_ns,)), effect, None, stream(1, 0, name), True, from_power_up)
+
+
 def trace(rows: list[Transmission]) -> list[Row]:
     return [(row.end_ns, row.bus, row.sender, row.frame.can_id, row.frame.flags, row.frame.data) for row in rows]
 
 
 def statuswords(rig: Rig) -> list[int]:
-    return [device.od.values[STATUSWORD] for device in rig.rack.devices]
+    return [device.od.values[STATUSWORD_KEY] for device in rig.rack.devices]
 
 
 def error_codes(rig: Rig) -> list[int]:
-    return [device.od.values[ERROR_CODE] for device in rig.rack.devices]
+    return [device.od.values[ERROR_CODE_KEY] for device in rig.rack.devices]
 
 
 def torques(rig: Rig) -> list[float]:
@@ -401,17 +431,224 @@ def test_one_drive_out_of_service_ends_the_motion_for_all(frame: Frame, kind: st
     assert all(word & 0x6F == 0x40 for word in statuswords(rig))
 
 
-@pytest.mark.xfail(
-    reason="the master passes over the state in heartbeats: a drive in Pre-operational beats on, and sends no TPDO2"
-)
-def test_drive_put_out_of_operational_ends_the_motion() -> None:
-    """Stop rule: that drive has left Operation enabled (6007) and cannot say so by PDO; its heartbeat says 7F."""
+@pytest.mark.parametrize(("command", "state"), [(0x80, 127), (0x02, 4)])
+def test_drive_put_out_of_operational_ends_the_motion(command: int, state: int) -> None:
+    """Stop rule: that drive has left Operation enabled (6007) and cannot say so by PDO; its heartbeat says 7F, or 4."""
     rig = new_rig(duration_ns=SECOND)
-    rig.loop.connect(Saboteur(2000 * MS + 1_950_000, Frame(0x000, b"\x80\x05")), [rig.drive_bus])
+    rig.loop.connect(Saboteur(2000 * MS + 1_950_000, Frame(0x000, bytes((command, 5)))), [rig.drive_bus])
     run_to(rig, Phase.MOTION)
     rig.loop.run_until(2000 * MS + 150 * MS)  # a heartbeat period, and the way to the controller
     assert torques(rig)[RIGHT_KNEE] == 0.0
     assert rig.controller.phase is not Phase.MOTION
+    (event,) = rig.controller.events
+    assert (event.joint, event.kind) == ("right_knee", "nmt_state")
+    assert f"NMT state {state}" in event.text
+    finished(rig)
+    assert not rig.controller.completed
+    assert torques(rig) == [0.0] * 6
+
+
+# ---- supervision that a fault takes away --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("cob_id", "code", "joints", "after_ns", "within_ns"),
+    [
+        (0x080, SYNC_LOST, NAMES, 8 * MS, 10 * MS),  # 5 periods from the last SYNC heard, up to one before the drop
+        (0x205, RPDO_LATE, ("right_knee",), 18 * MS, 20 * MS),  # 20 ms from the last command heard
+        (0x77F, HEARTBEAT_LOST, NAMES, 200 * MS, 300 * MS),  # 300 ms from the last heartbeat heard
+    ],
+)
+def test_drive_that_loses_its_master_ends_the_motion_by_its_emcy(
+    cob_id: int, code: int, joints: tuple[str, ...], after_ns: int, within_ns: int
+) -> None:
+    """6007 = 2: the drives disable, their EMCY reaches the controller within its two hops, and all six are disabled."""
+    rig = new_rig([dropped(cob_id, SECOND, SECOND)], duration_ns=2 * SECOND)
+    run_to(rig, Phase.STOPPING)
+    drop = rig.controller.time_zero + SECOND
+    first = rig.controller.events[0]
+    assert (first.joint, first.kind) == (joints[0], "emcy")
+    assert f"{code:04X}" in first.text
+    hops = 6 * 135_000 * 2  # six drives tell it at once, each over two buses; 135 us is the longest frame
+    assert drop + after_ns <= first.time_ns <= drop + within_ns + 2 * 135_000 + hops
+    finished(rig)
+    rig.loop.run_until(rig.loop.now + 100 * MS)  # a heartbeat period
+    assert {event.joint for event in rig.controller.events if f"{code:04X}" in event.text} == set(joints)
+    assert not rig.controller.completed
+    assert torques(rig) == [0.0] * 6
+    assert all(word & 0x6F == 0x40 for word in statuswords(rig))
+    assert error_codes(rig) == [0] * 6  # the injection ended with the motion: SYNC, commands, heartbeats came again
+    after = [row for row in rig.loop.trace if row.end_ns > first.time_ns + CYCLE and 0x201 <= row.frame.can_id <= 0x206]
+    assert after
+    assert {row.frame.data for row in after} == {b"\x00\x00\x00\x00"}  # disable voltage, no torque
+
+
+@pytest.mark.parametrize(("lost", "completed"), [(3, True), (5, False)])
+def test_drives_are_patient_for_five_sync_periods(lost: int, completed: bool) -> None:
+    """Three SYNCs lost for all: held for 8 ms, the motion goes on; five: 12 ms between two SYNCs, it ends."""
+    rig = finished(new_rig([dropped(0x080, 500 * MS, lost * CYCLE)], duration_ns=SECOND))
+    assert rig.controller.completed is completed
+    assert ([event.kind for event in rig.controller.events] == []) is completed
+    (record,) = rig.gateway.records
+    assert record.frames_injected == lost
+
+
+def test_drive_that_never_beats_is_missed_before_the_motion() -> None:
+    """Every heartbeat of one drive is lost on its way but the boot-up message: 300 ms after the start command."""
+    silence = dropped(0x705, 60 * MS, 10 * SECOND, to_drives=False, from_power_up=True)
+    rig = new_rig([silence])
+    run_to(rig, Phase.STOPPED)
+    (start,) = [
+        row.end_ns - row.frame.bits * 1000
+        for row in rig.loop.trace
+        if row.bus == CONTROLLER_BUS and row.frame.data == b"\x01\x00" and row.frame.can_id == 0
+    ]
+    event = rig.controller.events[0]
+    assert (event.joint, event.kind) == ("right_knee", "heartbeat_lost")
+    assert start - 135_000 + 300 * MS <= event.time_ns <= start + 300 * MS
+    assert not rig.controller.completed
+    assert torques(rig) == [0.0] * 6
+    with pytest.raises(NotStartedError, match="faulted run: the motion never began: right_knee: heartbeat lost"):
+        record_of(rig)
+
+
+# ---- what is recorded and judged ----------------------------------------------------------------------------------
+
+PINNED = RigParams(PLAN, True, STRIDE, DURATION)
+LIMITS = {name: limits_of(name) for name in NAMES}
+SOFT_PINS = math.radians(3.0)
+"""How far limp legs sink into the pins: soft contacts yield."""
+
+
+@pytest.fixture(scope="module")
+def pinned_golden() -> RunRecord:
+    """The fault-free run with pins. Not to be changed."""
+    return run_rig(PINNED, [])[0]
+
+
+def test_sync_lost_for_good_is_detected_and_leaves_the_legs_in_their_range(pinned_golden: RunRecord) -> None:
+    """From 1 s on no SYNC reaches the drives: valid, ended early, no failure within the give of the pins."""
+    faulted, _ = run_rig(PINNED, [dropped(0x080, SECOND, 60 * SECOND)])
+    found = judge(NAMES, LIMITS, pinned_golden, faulted, tolerance_rad=SOFT_PINS)
+    assert (found.outcome, found.passed, found.failures) == ("detected_safe", True, ())
+    assert (faulted.valid, faulted.completed) == (True, False)
+    (loss,) = faulted.activations
+    assert loss.signal == "SYNC 0x080"
+    assert loss.start_ns == faulted.time0_ns + SECOND
+    assert loss.frames_seen == loss.frames_injected == loss.frames_changed == 5  # then the drives knew, and all ended
+    told = [note for note in faulted.notes if "8700" in note.text]
+    assert sorted(note.node for note in told) == sorted(NAMES)
+    assert all(1.0 < note.time_s < 1.012 for note in told)
+    last = faulted.commands.t_s[-1]
+    assert 1.0 < last < 1.012  # the controller wanted nothing after that
+
+
+def test_limp_legs_that_leave_their_range_are_a_failure_all_the_same(pinned_golden: RunRecord) -> None:
+    """Detected is not safe by itself: without pins the legs swing past their range after the motion has ended."""
+    faulted, _ = run_rig(RigParams(PLAN, False, STRIDE, DURATION), [dropped(0x080, SECOND, 60 * SECOND)])
+    found = judge(NAMES, LIMITS, pinned_golden, faulted, tolerance_rad=SOFT_PINS)
+    assert (found.outcome, found.passed, faulted.completed) == ("failure", False, False)
+    assert all(one.time_s > 1.012 for one in found.failures)
+
+
+@pytest.mark.parametrize("bus", [CONTROLLER_BUS, DRIVE_BUS], ids=["controller", "drive"])
+def test_run_whose_cable_is_cut_is_valid_and_says_what_happened(pinned_golden: RunRecord, bus: int) -> None:
+    """Full transmit queues are explained by the cut: the record can be judged, and names every drive that was lost."""
+    rig = run_to(build_rig(PINNED, []), Phase.MOTION)
+    rig.loop.run_until(rig.controller.time_zero + 3 * SECOND)
+    bus_of(rig, bus).cut()
+    drive_through(rig, lambda share: None)
+    assert rig.loop.now > rig.controller.time_zero + DURATION
+    faulted = record_of(rig)
+    assert (faulted.valid, faulted.invalid_reasons, faulted.completed) == (True, [], False)
+    assert faulted.buses[bus].queue_overflows > 0
+    lost = [note for note in faulted.notes if note.kind == "heartbeat_lost"]
+    assert sorted(note.node for note in lost) == sorted(NAMES)
+    assert all(3.0 < note.time_s <= 3.3 for note in lost)
+    assert [note.node for note in faulted.notes if note.kind == "still_enabled"] == list(NAMES)  # nobody could tell
+    assert faulted.truth.t_s[-1] == 7.0  # the plant is watched to the end of the motion time
+    assert 3.0 < faulted.commands.t_s[-1] < 3.3
+    found = judge(NAMES, LIMITS, pinned_golden, faulted, tolerance_rad=SOFT_PINS)
+    assert (found.outcome, found.passed) == ("detected_safe", True)
+    strict = judge(NAMES, LIMITS, pinned_golden, faulted)
+    assert strict.outcome == "failure"  # limp feet lean on their pins
+    assert min(one.time_s for one in strict.failures) > 3.0
+
+
+def test_same_loss_of_frames_without_a_cut_is_invalid() -> None:
+    """A queue that overflows for no reason proves nothing; nor does a golden run that was given up."""
+    rig, _ = cut_after_3_s(DRIVE_BUS)
+    drive_through(rig, lambda share: None)
+    rig.drive_bus.cuts = 0
+    reasons = record_of(rig).invalid_reasons
+    assert len(reasons) == 2
+    assert "drive bus" in reasons[0]
+    assert "lost in full transmit queues" in reasons[0]
+    assert "given up without a fault" in reasons[1]
+
+
+def test_injections_at_or_after_the_end_of_the_motion_are_not_recorded() -> None:
+    """[0, duration): one ns before the end is the last start that counts, whatever an injector counts from."""
+    duration = SECOND
+    ends = [duration - 1, duration, duration + 1, duration + 100 * MS]
+    parts = [dropped(0x185, at_ns, 10 * MS, to_drives=False, name=f"n{at_ns}") for at_ns in ends]
+    late = dropped(0x186, 4 * SECOND, 10 * MS, to_drives=False, name="power up", from_power_up=True)
+    rig = finished(new_rig([*parts, late], duration_ns=duration))
+    rig.loop.run_until(5 * SECOND)
+    rig.gateway.finish(rig.loop.now)
+    record = record_of(rig)
+    assert [one.injector for one in record.activations] == [f"n{duration - 1}"]
+    assert record.activations[0].start_ns == record.time0_ns + duration - 1
+    assert record.completed
+    assert "power up" in {one.injector for one in rig.gateway.records}
+
+
+# ---- other bus plans ----------------------------------------------------------------------------------------------
+
+
+def test_rig_walks_on_a_plan_with_other_mappings_ids_and_rates() -> None:
+    """The drives are configured from the plan, whatever their defaults: order, COB-IDs, rates, a PDO more."""
+    pdos = (
+        Pdo("RPDO1", 0x300, 1, (TARGET_TORQUE, CONTROLWORD)),
+        Pdo("TPDO1", 0x380, 1, (VELOCITY, POSITION)),
+        Pdo("TPDO2", 0x400, 5, (ERROR_CODE, STATUSWORD)),
+        Pdo("TPDO3", 0x480, 20, (TORQUE,)),
+    )
+    plan = BusPlan(default_joints(), pdos=pdos)
+    rig = build_rig(RigParams(plan, False, STRIDE, 500 * MS), [])
+    finished(rig)
+    assert rig.controller.completed
+    assert (rig.controller.events, rig.controller.late) == ([], [0] * 6)
+    for joint, name in enumerate(NAMES):
+        wanted = np.array([sample.q_d[joint] for sample in rig.controller.samples])
+        zero = rig.controller.time_zero
+        rows = {row.time_ns: row.q[joint] for row in rig.rack.truth}
+        found = np.array([rows[zero + sample.cycle * CYCLE] for sample in rig.controller.samples])
+        assert math.sqrt(np.mean((found - wanted) ** 2)) < 0.01, name
+    zero = rig.controller.time_zero
+    frames = [row.frame for row in rig.loop.trace if row.bus == DRIVE_BUS and zero < row.end_ns <= zero + 480 * MS]
+    for node in range(1, 7):
+        sizes = {base: [len(frame.data) for frame in frames if frame.can_id == base + node] for base in (0x300, 0x380)}
+        assert sizes == {0x300: [4] * 240, 0x380: [8] * 240}
+        assert [len(frame.data) for frame in frames if frame.can_id == 0x400 + node] == [4] * 48
+        assert [len(frame.data) for frame in frames if frame.can_id == 0x480 + node] == [2] * 12
+    assert not {frame.can_id for frame in frames} & {*range(0x181, 0x187), *range(0x201, 0x207), *range(0x281, 0x287)}
+
+
+@pytest.mark.parametrize(("cycle_ns", "counter"), [(2 * MS, 240), (4 * MS, 10), (4 * MS, 0)])
+def test_drives_get_period_counter_and_deadline_of_the_plan(cycle_ns: int, counter: int) -> None:
+    """0x1006 in us, 0x1019, 0x1400:5 = 10 cycles in ms, 0x1016 the master's node; in each drive as the plan says."""
+    plan = dataclasses.replace(PLAN, cycle_ns=cycle_ns, sync_counter=counter)
+    rig = build_rig(RigParams(plan, False, STRIDE, SECOND), [])
+    run_to(rig, Phase.ENABLING)
+    for device in rig.rack.devices:
+        values = device.od.values
+        assert values[0x1006 << 8] == cycle_ns // 1000
+        assert values[0x1019 << 8] == counter
+        assert values[0x1400 << 8 | 5] == 10 * cycle_ns // MS
+        assert values[0x1016 << 8 | 1] == 127 << 16 | 300
+        assert values[0x1017 << 8] == 100
+    run_to(rig, Phase.STARTING)
 
 
 # ---- a start that fails -------------------------------------------------------------------------------------------
@@ -423,7 +660,7 @@ def test_rig_whose_cable_is_broken_from_the_start_says_so(bus: int) -> None:
     rig = new_rig()
     bus_of(rig, bus).cut()
     run_to(rig, Phase.FAILED)
-    assert 1000 * MS <= rig.loop.now <= 1000 * MS + CYCLE
+    assert POWER_UP_NS + 1000 * MS <= rig.loop.now <= POWER_UP_NS + 1000 * MS + CYCLE
     for part in ("left_hip", "node 1", "boot-up", "1 s", "check"):
         assert part in rig.master.failure
     rig.loop.run_until(2 * SECOND)

@@ -1,5 +1,6 @@
 """Table 1 at its edges, outcome, verdict and expectations."""
 
+import dataclasses
 import math
 from collections.abc import Callable, Sequence
 
@@ -197,6 +198,89 @@ def test_outcome_is_the_worst_that_happened(
     faulted = run_maker(bump_rad=2.0, activations=[activation_maker()] if activated else [])
     found = judge(SIX, limits, run_maker(), faulted)
     assert (found.outcome, found.passed) == (outcome, passed)
+
+
+@pytest.mark.parametrize(
+    ("activated", "limits", "outcome", "passed"),
+    [
+        (True, wide("right_knee"), "detected_safe", True),
+        (False, wide("right_knee"), "detected_safe", True),  # a cut cable is no injector's
+        (True, wide("right_knee", torque_nm=1.0), "detected_safe", True),
+        (True, wide("right_knee", max_angle_rad=0.5), "failure", False),
+        (True, wide("right_knee", max_angle_rad=-0.5), "invalid", False),
+    ],
+)
+def test_motion_that_was_ended_early_without_a_failure_is_detected_safe(
+    run_maker: RunMaker,
+    activation_maker: ActivationMaker,
+    activated: bool,
+    limits: dict[str, JointLimits],
+    outcome: str,
+    passed: bool,
+) -> None:
+    """Drive or controller ended the motion: safe unless a joint left its range all the same; errors are lesser."""
+    faulted = run_maker(bump_rad=2.0, activations=[activation_maker()] if activated else [])
+    found = judge(SIX, limits, run_maker(), dataclasses.replace(faulted, completed=False))
+    assert (found.outcome, found.passed) == (outcome, passed)
+
+
+def test_detected_safe_passes_on_errors_only_when_they_do_not_fail(run_maker: RunMaker) -> None:
+    """`fail_on: error` counts errors whatever the outcome is called; `completed` can be asked for."""
+    ended = dataclasses.replace(run_maker(), completed=False)
+    limits = wide("left_hip", torque_nm=1.0)
+    found = judge(SIX, limits, run_maker(), ended, fail_on="error")
+    assert (found.outcome, found.passed) == ("detected_safe", False)
+    wanted = [parse_expectation("completed == 1", SIX)]
+    found = judge(SIX, limits, run_maker(), ended, expectations=wanted)
+    assert (found.outcome, found.passed, found.expectations[0].found) == ("detected_safe", False, 0.0)
+    assert judge(SIX, limits, run_maker(), run_maker(), expectations=wanted).passed
+
+
+@pytest.mark.parametrize(
+    ("changed", "outcome"),
+    [
+        ((), "not_activated"),
+        ((0,), "not_manifested"),
+        ((0, 0), "not_manifested"),
+        ((1,), "masked"),
+        ((0, 1), "masked"),
+        ((1, 0), "masked"),
+        ((150, 148), "masked"),
+    ],
+)
+def test_faults_that_changed_no_frame_are_not_masked(
+    run_maker: RunMaker, activation_maker: ActivationMaker, changed: tuple[int, ...], outcome: str
+) -> None:
+    """Masked says something about the rig only when a frame really came out different: one of any activation."""
+    activations = []
+    for index, frames in enumerate(changed):
+        one = activation_maker(index=index)
+        one.frames_changed = frames
+        activations.append(one)
+    found = judge(SIX, wide("left_hip"), run_maker(), run_maker(activations=activations))
+    assert (found.outcome, found.passed) == (outcome, True)
+
+
+def test_not_manifested_is_the_least_that_can_be_said(
+    run_maker: RunMaker, activation_maker: ActivationMaker
+) -> None:
+    """An error, a motion that was ended, or a failure is worse, and is said instead."""
+    one = activation_maker()
+    one.frames_changed = 0
+    faulted = run_maker(bump_rad=2.0, activations=[one])
+    ended = dataclasses.replace(faulted, completed=False)
+    assert judge(SIX, wide("right_knee", torque_nm=1.0), run_maker(), faulted).outcome == "error"
+    assert judge(SIX, wide("right_knee"), run_maker(), ended).outcome == "detected_safe"
+    assert judge(SIX, wide("right_knee", max_angle_rad=0.5), run_maker(), faulted).outcome == "failure"
+
+
+@pytest.mark.parametrize(("tolerance_deg", "outcome"), [(0.0, "invalid"), (1.9, "invalid"), (2.1, "not_activated")])
+def test_golden_run_is_held_to_the_same_tolerance(run_maker: RunMaker, tolerance_deg: float, outcome: str) -> None:
+    """A golden run 2 deg beyond a limit: invalid unless the scenario allows as much."""
+    top = run_maker().truth.q[:, 4].max()
+    limits = wide("right_knee", max_angle_rad=top - math.radians(2.0))
+    found = judge(SIX, limits, run_maker(), run_maker(), tolerance_rad=math.radians(tolerance_deg))
+    assert (found.outcome, bool(found.golden_failures)) == (outcome, outcome == "invalid")
 
 
 @pytest.mark.parametrize(("fail_on", "passed"), [("failure", True), ("error", False)])
