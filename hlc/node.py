@@ -27,7 +27,8 @@ ENABLE_TIMEOUT_NS: Final = 2000 * MS
 """How long the drives may take to Operation enabled."""
 
 DISABLE_TIMEOUT_NS: Final = 200 * MS
-"""How long the drives may take to report that they are disabled."""
+"""How long the drives may take at least to report that they are disabled; TPDO2 comes with every 10th SYNC."""
+DISABLE_TIMEOUT_CYCLES: Final = 25
 
 STOPPING_ERRORS: Final = (HEARTBEAT_LOST, RPDO_TIMEOUT, SYNC_LOST)
 """EMCY codes with which a drive drops its torque (its 0x6007 = 2). The statusword says so too, but needs SYNC."""
@@ -126,6 +127,7 @@ class HighLevelController(MasterApplication):
         self._controlword_at: Final[int] = rpdo1.place("controlword")
         self._torque_at: Final[int] = rpdo1.place("target_torque")
         self._command: Final[list[int]] = [0] * len(rpdo1.content)
+        self._disable_ns: Final[int] = max(DISABLE_TIMEOUT_NS, DISABLE_TIMEOUT_CYCLES * plan.cycle_ns)
         self._deadline_ns: Final[int] = floor(plan.cycle_ns * DEADLINE_SHARE)
         self._q: list[float] = [0.0] * count
         self._dq: list[float] = [0.0] * count
@@ -282,14 +284,14 @@ class HighLevelController(MasterApplication):
                     "check the drive's error code",
                 )
             self.phase = _STOPPING
-            self._give_up_at = now + DISABLE_TIMEOUT_NS
+            self._give_up_at = now + self._disable_ns
 
     def _stop(self, now: int, out: Out) -> None:
         """End the motion; the drives get "disable voltage" from the next torques on."""
         if self.phase in (_STOPPING, _STOPPED):
             return
         self.phase = _STOPPING
-        self._give_up_at = now + DISABLE_TIMEOUT_NS
+        self._give_up_at = now + self._disable_ns
         self._send_status(out)
 
     def _try_leave(self, now: int) -> None:

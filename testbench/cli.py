@@ -59,7 +59,7 @@ def _parser() -> argparse.ArgumentParser:
     run = verbs.add_parser("run", help="golden run + faulted run, verdict", description=_run.__doc__)
     run.add_argument("scenario", type=Path, metavar="SCENARIO.yaml", help="what to run; see scenarios/")
     run.add_argument("--seed", metavar="N", help="instead of the scenario's seed")
-    run.add_argument("--out", type=Path, metavar="DIR", help="result folder (default: results/NAME-SEED)")
+    run.add_argument("--out", type=Path, metavar="DIR", help="result folder (default: results/NAME-SEED[-CHANGES])")
     run.add_argument(
         "--set",
         action="append",
@@ -73,6 +73,7 @@ def _parser() -> argparse.ArgumentParser:
 
     check = verbs.add_parser("check", help="validate a scenario and say what it will do", description=_check.__doc__)
     check.add_argument("scenario", type=Path, metavar="FILE", help="a scenario file")
+    check.add_argument("--seed", metavar="N", help="instead of the scenario's seed")
     check.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="overrides", help="as for run")
     check.set_defaults(verb=_check)
 
@@ -111,10 +112,10 @@ def _run(options: argparse.Namespace) -> int:
         overrides.append(f"seed={options.seed}")
     try:
         scenario = load_scenario(options.scenario, overrides)
-        folder = options.out or default_folder(scenario.name, scenario.seed)
+        folder = options.out or default_folder(scenario.name, scenario.seed, options.overrides)
         check_folder(folder)
     except (FileErrors, BenchError) as error:
-        _say(str(error) if options.seed is None else str(error).replace("--set seed=", "--seed "))
+        _say(_as_typed(error, options))
         return USAGE
     for warning in scenario.warnings:
         _say(f"warning: {warning}")
@@ -152,10 +153,13 @@ def _check(options: argparse.Namespace) -> int:
     from fi_gateway.marked_yaml import FileErrors
     from testbench.scenario import describe, load_scenario
 
+    overrides = list(options.overrides)
+    if options.seed is not None:
+        overrides.append(f"seed={options.seed}")
     try:
-        scenario = load_scenario(options.scenario, options.overrides)
+        scenario = load_scenario(options.scenario, overrides)
     except FileErrors as error:
-        _say(str(error))
+        _say(_as_typed(error, options))
         return USAGE
     _print("\n".join(describe(scenario)) + "\n")
     for warning in scenario.warnings:
@@ -202,6 +206,14 @@ def _print(text: str) -> None:
         sys.stdout.flush()
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _say(f"stdout: {error.strerror or error}; the result could not be printed there")
+
+
+def _as_typed(error: Exception, options: argparse.Namespace) -> str:
+    """A complaint in the words of the command line: the seed came as --seed."""
+    return str(error) if options.seed is None else str(error).replace("--set seed=", "--seed ")
 
 
 def _say(text: str) -> None:

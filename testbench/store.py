@@ -12,7 +12,7 @@ import platform
 import re
 import shutil
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Final
@@ -40,10 +40,11 @@ FILES: Final = frozenset(
 """What a result folder may hold; a folder with anything else in it is somebody's, and never replaced."""
 
 
-def default_folder(name: str, seed: int) -> Path:
-    """`results/<name>-<seed>`, whatever letters the scenario's name has."""
+def default_folder(name: str, seed: int, overrides: Sequence[str] = ()) -> Path:
+    """`results/<name>-<seed>`, whatever letters the scenario's name has; overrides give a place of its own."""
     plain = re.sub(r"[^A-Za-z0-9._-]+", "_", name).lstrip(".")[:100] or "scenario"
-    return Path("results") / f"{plain}-{seed}"
+    changes = f"-{zlib.crc32(' '.join(overrides).encode()):08x}" if overrides else ""
+    return Path("results") / f"{plain}-{seed}{changes}"
 
 
 def result_files(

@@ -325,7 +325,7 @@ def _outcome_text(document: Summary) -> str:
         "invalid": "the run is invalid and proves nothing",
         "failure": "failure, a joint went beyond its range of travel",
         "detected_safe": "detected, drives or controller ended the motion before a failure",
-        "error": "error, a torque or speed limit was exceeded",
+        "error": "no failure, but a torque or speed limit was exceeded",
         "masked": "masked, faults were injected and every limit was kept",
         "not_manifested": "faults were activated but changed no frame",
         "not_activated": "no fault was activated",
@@ -343,15 +343,17 @@ def _injection_lines(document: Summary) -> list[str]:
         return ["injections: none"]
     name = max(len(one["injector"]) for one in injections)
     signal = max(len(one["signal"] or "whole frame") for one in injections)
+    seen = sum(one["frames_seen"] for one in injections)
     lines = []
     for one in injections:
-        end = "  no end" if one["end_s"] is None else f"{one['end_s']:8.3f}"
+        end = "   to the end" if one["end_s"] is None else f"..{one['end_s']:8.3f} s "
+        what = "lost" if one["first_before"] is not None and one["first_after"] is None else "changed"
+        cut = f", {one['saturated']} cut at the range" if one["saturated"] else ""
         lines.append(
-            f"  {one['injector']:<{name}}  {one['signal'] or 'whole frame':<{signal}}  "
-            f"{one['start_s']:8.3f} ..{end} s  {one['frames']:5d} frames changed  {one['cause']}"
+            f"  {one['injector']:<{name}}  {one['signal'] or 'whole frame':<{signal}}  {one['start_s']:8.3f} {end}"
+            f"  {one['frames']:5d} of {one['frames_seen']} frames {what}{cut}  {one['cause']}"
         )
-    head = f"injections: {counts['activated']} activated, {counts['manifested']} of {counts['injected']} frames changed"
-    return [head, *lines]
+    return [f"injections: {counts['activated']} activated, {counts['manifested']} of {seen} frames hit", *lines]
 
 
 def _joint_lines(document: Summary) -> list[str]:

@@ -17,7 +17,7 @@ import testbench.cli
 import testbench.run
 from testbench.cli import main
 from testbench.scenario import JOINT_NAMES, load_scenario
-from testbench.store import FILES
+from testbench.store import FILES, default_folder
 
 ROOT = Path(__file__).parents[2]
 SCENARIOS = ROOT / "scenarios"
@@ -33,6 +33,7 @@ for override in (
     "injectors.zero_velocity.effect.duration=0.2s",
 ):
     SHORT += ["--set", override]
+RESULT = default_folder("knee_freeze_at", 7, SHORT[3::2]).name
 
 # The program, with the interrupt key at work also where this test runs in the background of a shell.
 PROGRAM = (
@@ -74,7 +75,7 @@ def test_stdout_is_one_strict_json_document_and_stderr_the_talk(
     document = json.loads(done.stdout, parse_constant=refuse_constant)
     assert isinstance(document, dict)
     assert done.stdout.endswith("}\n")
-    assert done.stderr == f"result folder: {folder / 'results' / 'knee_freeze_at-7'}\n"
+    assert done.stderr == f"result folder: {folder / 'results' / RESULT}\n"
 
 
 HASH = re.compile(r"[0-9a-f]{64}")
@@ -149,7 +150,7 @@ def test_seed_and_set_change_what_is_run(short: tuple[Path, subprocess.Completed
         assert injection["start_s"] == pytest.approx(0.1, abs=1e-9)  # times are whole ns, told in s
         assert injection["end_s"] == pytest.approx(0.3, abs=1e-9)
         assert injection["frames_seen"] == 100  # 0.2 s at 500 Hz
-    read = load_scenario(folder / "results" / "knee_freeze_at-7" / "scenario.yaml")
+    read = load_scenario(folder / "results" / RESULT / "scenario.yaml")
     assert read == load_scenario(KNEE, ["seed=7", *SHORT[3::2]])
     assert read.injectors["freeze_position"].effect.mean_ns() == 200_000_000
 
@@ -161,10 +162,10 @@ def test_seed_and_set_change_what_is_run(short: tuple[Path, subprocess.Completed
 def test_result_folder_holds_what_the_design_lists(short: tuple[Path, subprocess.CompletedProcess[str]]) -> None:
     """scenario.yaml, summary.json, a candump log per bus, joint traces as Parquet, plots as PNG; nothing beside it."""
     folder, done = short
-    result = folder / "results" / "knee_freeze_at-7"
+    result = folder / "results" / RESULT
     assert done.returncode == 0, done.stderr
     assert names(folder) == ["results"]
-    assert names(folder / "results") == ["knee_freeze_at-7"]
+    assert names(folder / "results") == [RESULT]
     assert set(names(result)) == FILES
     assert (result / "summary.json").read_text(encoding="utf-8") == done.stdout
     for path in result.glob("*.png"):
@@ -388,7 +389,9 @@ def test_exit_code_is_the_verdict(
     assert main(["run", GOLDEN, *short]) == code
     captured = capsys.readouterr()
     assert captured.out.startswith(f"{verdict}  golden, seed 2020: no fault was activated\n")
-    assert captured.err == f"result folder: {place / 'results' / 'golden-2020'}\n"
+    folder = default_folder("golden", 2020, short[1::2])
+    assert folder != default_folder("golden", 2020)  # a changed scenario does not replace the result of the file
+    assert captured.err == f"result folder: {place / folder}\n"
 
 
 DEAF = """\

@@ -130,7 +130,7 @@ def test_text_says_verdict_limits_and_expectations(failed: Summary) -> None:
     assert lines[0] == "FAIL  knee_freeze, seed 2020: failure, a joint went beyond its range of travel"
     text = "\n".join(lines)
     assert "8.5 x real time" in text
-    assert "2 activated, 296 of 300 frames changed" in text
+    assert "2 activated, 296 of 300 frames hit" in text
     assert "max angle" in text
     assert "limit 54.9 N m" in text
     assert "not met: failures == 0 (found 1)" in text
