@@ -24,7 +24,7 @@ endif
 
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test lint unit compile bench lock clean moved
+.PHONY: help setup demo test lint unit realtime vcan compile bench soak lock clean moved
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-8s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -53,15 +53,21 @@ demo: $(READY) ## a frozen knee encoder, with its verdict (pass and fail are bot
 	$(BIN)/python -c 'import json; print("verdict:", json.load(open("results/demo/summary.json"))["verdict"])' && \
 	echo "traces and plots: results/demo"
 
-test: lint unit compile ## everything CI holds: lint, all tests, compiled build equals interpreted build
+test: lint unit compile ## everything CI holds: lint, tests, compiled build equals interpreted build
 
 lint: $(READY) ## ruff, mypy --strict, import contracts
 	$(BIN)/python -m ruff check .
 	$(BIN)/python -m mypy
 	$(BIN)/lint-imports --no-logo
 
-unit: $(READY) ## pytest alone, on WORKERS=2 processes
-	$(BIN)/python -m pytest -n $(WORKERS)
+unit: $(READY) ## pytest alone, on WORKERS=2 processes, without what runs against the clock
+	$(BIN)/python -m pytest -n $(WORKERS) -m "not realtime" --ignore=tests/vcan
+
+realtime: $(READY) ## tests against the clock, one at a time; says how many were skipped on a machine too busy for them
+	$(BIN)/python -m pytest -m realtime --ignore=tests/vcan -rs
+
+vcan: $(READY) ## tests on a real SocketCAN: vcan where the kernel has it, else User Mode Linux (a Debian package, fetched)
+	$(BIN)/python -m pytest tests/vcan -rs
 
 compile: $(READY) ## the core compiled with mypyc must give the same traces (skipped, saying why, without a C compiler)
 	$(BIN)/python benchmarks/compile_core.py
@@ -70,6 +76,9 @@ bench: $(READY) ## measured ratios against the budgets; nothing is asserted
 	@found=0; for file in benchmarks/bench_*.py; do \
 	  if [ -e "$$file" ]; then found=1; $(BIN)/python "$$file" || exit $$?; fi; done; \
 	[ $$found = 1 ] || { echo "make: there is no benchmarks/bench_*.py" >&2; exit 1; }
+
+soak: $(READY) ## ten million frames through the gateway, then a full bus: none lost, doubled, changed or out of order
+	$(BIN)/python -m benchmarks.soak
 
 lock: ## for maintainers: newest versions allowed by pyproject.toml into requirements.lock, for all platforms
 	@rm -rf build/lock && $(PYTHON) -m venv build/lock && build/lock/bin/python -m pip install --quiet uv

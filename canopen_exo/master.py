@@ -353,6 +353,8 @@ class Master(Node):
             self.application.operational(now, out)
 
     def _plan_supervision(self) -> None:
+        if self.state is MasterState.RESETTING:  # a frame came before the first wake-up: that is still to come
+            return
         at = self.heartbeat.due
         if self.state is MasterState.BOOTING:
             for slave in self.slaves:

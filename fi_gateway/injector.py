@@ -106,8 +106,9 @@ class Activation:
     """One activation. Times in ns on the loop's clock.
 
     injector, index: name, and number of the activation from 0; signal: "node.name", for whole frames the target's name;
-    cause: "event" or "trigger:<name>"; due_ns: the time drawn, given or triggered; start_ns: when the window opened,
-    later than due_ns only when the fault had to wait for a value; duration_ns: as drawn or given, NEVER for no limit;
+    cause: "event", "trigger:<name>" or "command"; due_ns: the time drawn, given, triggered or commanded;
+    start_ns: when the window opened, later than due_ns only when the fault had to wait for a value;
+    duration_ns: as drawn or given, NEVER for no limit;
     end_ns: first instant outside the window, as planned until it closes; a window without limit keeps NEVER.
     frames_seen: target frames that reached it; frames_unfit: of those, too short to act on; frames_injected: acted on
     (a drop that spares a frame does not act on it); frames_changed: of those, changed or lost; saturated: values cut at
@@ -146,8 +147,9 @@ class Injector:
 
     inert --start--> armed --open--> active --close--> armed, or spent (once, infinite)
     armed --open, no value yet--> waiting --open at the next frame--> active; any --stop--> spent
+    any but spent --disarm--> inert; inert or spent --arm--> armed, or inert while its start has not come
 
-    An event or trigger that comes while waiting or active is ignored. enabled False: never leaves inert.
+    An event or trigger that comes while waiting or active is ignored. enabled False: never leaves inert until armed.
     from_power_up: its times count from power-up instead of time 0. rng: the stream of this injector alone (`stream`).
     next_ns: when it acts by itself next (event, or end of the window), NEVER for not at all; held: the last frame of
     each target COB-ID that reached it, if it had the least_bytes that the signal needs. counted: the effect ends after
@@ -175,7 +177,7 @@ class Injector:
         self.name: Final[str] = name
         self.target: Final[Target] = target
         self.trigger: Final[Trigger | None] = trigger
-        self.enabled: Final[bool] = enabled
+        self.enabled: bool = enabled
         self.from_power_up: Final[bool] = from_power_up
         self.counted: Final[bool] = effect.frames > 0
         self.least_bytes: Final[int] = 0 if signal is None else (signal.start + signal.length + 7) // 8
@@ -191,7 +193,7 @@ class Injector:
         self._event: Final[Event] = event
         self._effect: Final[Effect] = effect
         self._rng: Final[Generator] = rng
-        self._base_ns: int = 0
+        self._base_ns: int = NEVER
         self._cause: str = ""
         self._due_ns: int = NEVER
         self._left: int = 0
@@ -199,19 +201,37 @@ class Injector:
 
     def start(self, base_ns: int) -> None:
         """Time 0 (or power-up) is `base_ns`: arm."""
-        if self.enabled and self.phase is INERT:
+        if self.phase is INERT:
             self._base_ns = base_ns
-            self._arm(self._event.first())
+            if self.enabled:
+                self._arm(self._event.first())
+
+    def arm(self, now: int) -> None:
+        """Live control: wait for event and trigger, also when disabled or spent; what was due before `now` is over."""
+        self.enabled = True
+        if self.phase is SPENT:
+            self.phase = INERT
+        if self.phase is INERT and self._base_ns != NEVER:
+            relative_ns = now - self._base_ns
+            self._arm(self._event.next(relative_ns) if relative_ns > 0 else self._event.first())
+
+    def disarm(self, now: int) -> None:
+        """Live control: no more injection until armed again; an open window ends at `now`."""
+        self.enabled = False
+        self.close(now)
+        if self.phase is not SPENT:
+            self.phase, self.next_ns = INERT, NEVER
 
     def open(self, now: int, cause: str) -> Activation | None:
         """Open the window at `now`; None when the fault has to wait. For a waiting one the first cause stays."""
         if self.phase is not WAITING:
             self._cause, self._due_ns = cause, now
-        if not self._fault.begin(now, self.held, self._rng):
+        start_ns = now if now > self._due_ns else self._due_ns  # a frame stamped before a command, read after it
+        if not self._fault.begin(start_ns, self.held, self._rng):
             self.phase, self.next_ns = WAITING, NEVER
             return None
         opened = Activation(
-            self.name, self.activated, self._signal, self._cause, self._due_ns, now, self._effect.duration()
+            self.name, self.activated, self._signal, self._cause, self._due_ns, start_ns, self._effect.duration()
         )
         self.phase, self.next_ns, self._current = ACTIVE, opened.end_ns, opened
         self.activated += 1

@@ -96,6 +96,7 @@ class HighLevelController(MasterApplication):
 
     events: what it noticed; samples: one per cycle of the motion; late: per joint, cycles of the motion whose values
     did not come before the deadline; completed: True when the whole motion was walked.
+    leave: set from outside to end the motion with the next SYNC, whatever is left of it.
     """
 
     def __init__(self, plan: BusPlan, controller: Controller, motion_cycles: int) -> None:
@@ -107,6 +108,7 @@ class HighLevelController(MasterApplication):
         self.phase: Phase = _WAITING
         self.time_zero: int = NEVER
         self.completed: bool = False
+        self.leave: bool = False
         self.events: list[Event] = []
         self.samples: list[Sample] = []
         self.late: list[int] = [0] * count
@@ -164,6 +166,8 @@ class HighLevelController(MasterApplication):
                 self._stop(now, out)
         elif self.phase is _STOPPING:
             self._try_leave(now)
+        if self.leave and self.phase is not _WAITING:
+            self._stop(now, out)
         if self.phase in (_STARTING, _MOTION) and self._motion_cycle % ids.STATUS_EVERY == 0:
             self._send_status(out)
 

@@ -13,6 +13,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
+from testbench.cli_rig import add_rig_options, add_verbs, named_buses
+
 PASS: Final = 0
 FAIL: Final = 1
 USAGE: Final = 2
@@ -69,6 +71,8 @@ def _parser() -> argparse.ArgumentParser:
         help="change the scenario, as in injectors.freeze_position.effect.duration=0.5s; may be repeated",
     )
     run.add_argument("--json", action="store_true", help="print the result as one JSON document")
+    run.add_argument("--realtime", action="store_true", help="as processes against the clock, not in virtual time")
+    add_rig_options(run)
     run.set_defaults(verb=_run)
 
     check = verbs.add_parser("check", help="validate a scenario and say what it will do", description=_check.__doc__)
@@ -76,6 +80,8 @@ def _parser() -> argparse.ArgumentParser:
     check.add_argument("--seed", metavar="N", help="instead of the scenario's seed")
     check.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="overrides", help="as for run")
     check.set_defaults(verb=_check)
+
+    add_verbs(verbs)
 
     export = verbs.add_parser("export", help="write files for other tools", description=_export.__doc__)
     export.add_argument("what", choices=("eds", "dbc", "schema"), help="which of them")
@@ -100,7 +106,10 @@ class _Version(argparse.Action):
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Run a scenario in virtual time: a golden run without faults, a run with them, and a verdict on the pair."""
+    """Run a scenario: a golden run without faults, a run with them, and a verdict on the pair.
+
+    In virtual time, or with --realtime as processes against the clock, on an own hub or on the buses named.
+    """
     from fi_gateway.marked_yaml import FileErrors
     from testbench.errors import BenchError
     from testbench.scenario import load_scenario
@@ -112,6 +121,7 @@ def _run(options: argparse.Namespace) -> int:
         overrides.append(f"seed={options.seed}")
     try:
         scenario = load_scenario(options.scenario, overrides)
+        buses = _real_time_buses(options)
         folder = options.out or default_folder(scenario.name, scenario.seed, options.overrides)
         check_folder(folder)
     except (FileErrors, BenchError) as error:
@@ -120,15 +130,24 @@ def _run(options: argparse.Namespace) -> int:
     for warning in scenario.warnings:
         _say(f"warning: {warning}")
 
+    from canopen_exo.errors import CanopenExoError
     from hlc.limits import limits_of
     from joint_emulators.errors import JointEmulatorError
     from testbench.report import Plotted, plot_files
-    from testbench.run import run_scenario
 
     try:
         with _progress(scenario.name) as progress:
-            result = run_scenario(scenario, progress)
-    except (BenchError, JointEmulatorError) as error:
+            if options.realtime:
+                from testbench.realtime_run import run_realtime
+
+                result = run_realtime(
+                    scenario, buses, frozenset(options.without), fifo=options.fifo, progress=progress
+                )
+            else:
+                from testbench.run import run_scenario
+
+                result = run_scenario(scenario, progress)
+    except (BenchError, JointEmulatorError, CanopenExoError) as error:
         _say(f"{scenario.name}: run invalid: {error}")
         return INVALID
     names = tuple(joint.name for joint in scenario.plan.joints)
@@ -146,6 +165,16 @@ def _run(options: argparse.Namespace) -> int:
     if not result.document["valid"]:
         return INVALID
     return PASS if result.judgement.passed else FAIL
+
+
+def _real_time_buses(options: argparse.Namespace) -> tuple[str, str] | None:
+    """The buses named; raises BenchError when something of real time is given without --realtime."""
+    from testbench.errors import BenchError
+
+    buses = named_buses(options)
+    if not options.realtime and (buses or options.without or options.fifo):
+        raise BenchError("--controller-bus, --drive-bus, --without and --fifo are of real time; add --realtime")
+    return buses
 
 
 def _check(options: argparse.Namespace) -> int:

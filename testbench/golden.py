@@ -71,8 +71,10 @@ def tracking_rmse(joints: tuple[str, ...], truth: Truth, commands: Commands, dur
     """Reference against truth [rad], by joint, over the control instants of the motion.
 
     Each reference is compared with the sample the drives latch at that SYNC: the last finished plant step at or before
-    the instant. Raises BenchError when no control instant of the motion has a sample.
+    the instant. Raises BenchError when no control instant of the motion has a sample. Empty without a reference.
     """
+    if not commands.has_reference:
+        return {}
     check_joints(joints, truth.q)
     check_joints(joints, commands.q_ref)
     latest = np.searchsorted(truth.t_s, commands.t_s + _ROUNDING_S, side="right") - 1

@@ -40,6 +40,7 @@ class Commands:
 
     t_s (m,) s; q_ref (m, joints) rad and dq_ref (m, joints) rad/s: reference for that instant;
     tau_command (m, joints) N m: the torque worked out in that cycle, before its clamp.
+    The reference of a foreign controller is not known: q_ref and dq_ref are then (m, 0).
     """
 
     t_s: Array
@@ -49,8 +50,13 @@ class Commands:
 
     def __post_init__(self) -> None:
         """Refuse arrays that do not fit together or are not finite; raises BenchError."""
-        parts = (("q_ref", self.q_ref), ("dq_ref", self.dq_ref), ("tau_command", self.tau_command))
-        _check("commands", self.t_s, parts)
+        parts = (("tau_command", self.tau_command), ("q_ref", self.q_ref), ("dq_ref", self.dq_ref))
+        _check("commands", self.t_s, parts if self.has_reference else parts[:1])
+
+    @property
+    def has_reference(self) -> bool:
+        """Whether it is known what the controller followed."""
+        return not self.q_ref.shape == self.dq_ref.shape == (self.t_s.size, 0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +89,8 @@ class RunRecord:
     time0_ns: time 0 on the loop's clock, as the gateway took it from the bus; duration_ns: of the motion, from time 0;
     buses: by bus index; activations: in the order they began, closed; notes: in time order; completed: False when the
     controller ended the motion early; held_cycles: per joint, cycles in which its last sample was used again because
-    no new one had come; invalid_reasons: why the run proves nothing, empty when it is valid.
+    no new one had come; invalid_reasons: why the run proves nothing, empty when it is valid; source: of the truth,
+    "plant", or "bus" when foreign drives were on it and only their frames tell.
     """
 
     rows: list[Transmission]
@@ -97,6 +104,7 @@ class RunRecord:
     completed: bool = True
     held_cycles: list[int] = field(default_factory=list)
     invalid_reasons: list[str] = field(default_factory=list)
+    source: str = "plant"
 
     @property
     def valid(self) -> bool:

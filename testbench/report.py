@@ -109,11 +109,13 @@ def fault_figure(shown: Plotted) -> "Figure":
     position, velocity, torque = figure.subplots(3, 1, sharex=True)
     low, high = np.degrees(limit.min_angle_rad), np.degrees(limit.max_angle_rad)
     _panel(position, "angle [deg]", (low, high))
-    position.plot(t_said, np.degrees(said.q_ref[rows, k]), color=_REFERENCE, lw=1.0, ls=(0, (4, 3)), zorder=4)
+    if said.has_reference:
+        position.plot(t_said, np.degrees(said.q_ref[rows, k]), color=_REFERENCE, lw=1.0, ls=(0, (4, 3)), zorder=4)
     _pair(position, golden, faulted, golden.q[:, k], faulted.q[:, k], 180 / np.pi)
     speed = limit.speed_rad_s * _RPM
     _panel(velocity, "speed [rpm]", (-speed, speed))
-    velocity.plot(t_said, said.dq_ref[rows, k] * _RPM, color=_REFERENCE, lw=1.0, ls=(0, (4, 3)), zorder=4)
+    if said.has_reference:
+        velocity.plot(t_said, said.dq_ref[rows, k] * _RPM, color=_REFERENCE, lw=1.0, ls=(0, (4, 3)), zorder=4)
     _pair(velocity, golden, faulted, golden.dq[:, k], faulted.dq[:, k], _RPM)
     _panel(torque, "torque [N m]", (-limit.torque_nm, limit.torque_nm))
     # an artist, not a plot: a command of thousands of N m shall not squeeze the torques that acted
@@ -128,7 +130,7 @@ def fault_figure(shown: Plotted) -> "Figure":
     position.set_title(f"RMSE against golden: {one.rmse_position_rad:.4f} rad", loc="right", fontsize=9)
     velocity.set_title(f"RMSE against golden: {one.rmse_velocity_rad_s:.3f} rad/s", loc="right", fontsize=9)
     torque.set_title(f"RMSE against golden: {one.rmse_torque_nm:.2f} N m", loc="right", fontsize=9)
-    _legend(figure, with_reference=True, with_windows=bool(windows(shown, joint)))
+    _legend(figure, with_reference=said.has_reference, with_windows=bool(windows(shown, joint)))
     return figure
 
 

@@ -65,25 +65,38 @@ class Rig:
 def build_rig(params: RigParams, injectors: list[Injector]) -> Rig:
     """A rig at power-up, time 0 of its loop."""
     plan = params.plan
-    names = tuple(joint.name for joint in plan.joints)
-    mjcf = build_mjcf(USER_75KG, MOTORS, params.stops)
-    law = build_controller(
-        paper_params(names, plan.cycle_ns, params.stride_ns), names, packaged_recording(), mjcf
-    )
-    controller = HighLevelController(plan, law, params.duration_ns // plan.cycle_ns)
-    master = Master(plan, tuple(_slave(plan, joint) for joint in plan.joints), controller)
+    mjcf = build_mechanics(params)
+    master, controller = build_master(params, mjcf)
     gateway = Gateway(injectors, plan.cycle_ns)
-    rack = _rack(plan, mjcf, names)
+    rack = build_rack(params, mjcf)
     controller_bus = Medium("controller", CONTROLLER_BUS, plan.bitrate)
     drive_bus = Medium("drive", DRIVE_BUS, plan.bitrate)
     loop = Loop([controller_bus, drive_bus])
     loop.connect(master, [controller_bus])
     loop.connect(gateway, [controller_bus, drive_bus])
-    loop.connect(rack, [drive_bus] * len(names))
+    loop.connect(rack, [drive_bus] * len(plan.joints))
     return Rig(params, loop, controller_bus, drive_bus, master, controller, gateway, rack)
 
 
-def _rack(plan: BusPlan, mjcf: str, names: tuple[str, ...]) -> Rack:
+def build_mechanics(params: RigParams) -> str:
+    """The MJCF text of exoskeleton and user, which plant and controller both read."""
+    return build_mjcf(USER_75KG, MOTORS, params.stops)
+
+
+def build_master(params: RigParams, mjcf: str, cycles: int = -1) -> tuple[Master, HighLevelController]:
+    """The high-level controller on the bus. cycles: of the motion; -1 for the duration in `params`."""
+    plan = params.plan
+    names = tuple(joint.name for joint in plan.joints)
+    law = build_controller(
+        paper_params(names, plan.cycle_ns, params.stride_ns), names, packaged_recording(), mjcf
+    )
+    controller = HighLevelController(plan, law, params.duration_ns // plan.cycle_ns if cycles < 0 else cycles)
+    return Master(plan, tuple(_slave(plan, joint) for joint in plan.joints), controller), controller
+
+
+def build_rack(params: RigParams, mjcf: str) -> Rack:
+    """The drives on their plant; drive k sends on port k."""
+    plan = params.plan
     pattern = ObjectDictionary(load_eds())
     devices, drives = [], []
     for port, joint in enumerate(plan.joints):
@@ -92,7 +105,7 @@ def _rack(plan: BusPlan, mjcf: str, names: tuple[str, ...]) -> Rack:
         drive = Drive(od, EncoderParams(joint.encoder_counts, 0, 1), VELOCITY)
         drives.append(drive)
         devices.append(Device(od, joint.node_id, drive, port))
-    return Rack(Plant(mjcf, names), devices, drives)
+    return Rack(Plant(mjcf, tuple(joint.name for joint in plan.joints)), devices, drives)
 
 
 def _pdo_writes(plan: BusPlan, pdo: Pdo, joint: JointNode) -> list[Write]:

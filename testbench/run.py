@@ -17,7 +17,7 @@ from canopen_exo.bus.node import MS, NEVER, SECOND
 from fi_gateway.injector import Injector
 from fi_gateway.schema import build_injectors
 from hlc.limits import limits_of
-from hlc.node import Phase
+from hlc.node import HighLevelController, Phase
 from testbench.errors import BenchError
 from testbench.record import BusStats, Commands, RigEvent, RunRecord, Truth
 from testbench.rig import Rig, RigParams, build_rig
@@ -108,16 +108,18 @@ def drive_through(rig: Rig, progress: Progress) -> None:
     latest = START_NS + params.stride_ns + params.duration_ns + LEAVE_NS
     while loop.now < latest:
         loop.run_until(loop.now + CHUNK_NS)
-        phase = controller.phase
-        if phase is Phase.FAILED:
-            break
-        if phase is Phase.STOPPED and loop.now > controller.time_zero + params.duration_ns:
-            break
-        if phase is Phase.STOPPED and controller.time_zero == NEVER:
+        if motion_over(controller, params.duration_ns, loop.now):
             break
         progress(min(1.0, loop.now / (latest - START_NS)))
     rig.gateway.finish(loop.now)
     progress(1.0)
+
+
+def motion_over(controller: HighLevelController, duration_ns: int, now: int) -> bool:
+    """Whether the start has failed, or the controller has stopped and the time of the motion is over."""
+    if controller.phase is Phase.STOPPED:
+        return controller.time_zero == NEVER or now > controller.time_zero + duration_ns
+    return controller.phase is Phase.FAILED
 
 
 def record_of(rig: Rig) -> RunRecord:

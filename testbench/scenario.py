@@ -18,7 +18,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, PlainSerializer, Pl
 from canopen_exo.bus.node import MS, SECOND
 from canopen_exo.errors import CanopenExoError
 from canopen_exo.plan import BusPlan, JointNode
-from fi_gateway.boundary import Angle, Later, Span, SpecModel, Text, dump, json_schema, validate
+from fi_gateway.boundary import Angle, Later, Share, Span, SpecModel, Text, Time, dump, json_schema, validate
 from fi_gateway.marked_yaml import Data, Document, apply_override, load, parse, write
 from fi_gateway.quantity import describe_value, format_duration, format_hertz, parse_hertz
 from fi_gateway.schema import InjectorSpec, check_injectors, describe_injectors, injector_warnings
@@ -29,6 +29,7 @@ __all__ = [
     "JOINT_NAMES",
     "Expectation",
     "Motion",
+    "RealTime",
     "Rig",
     "Scenario",
     "default_joints",
@@ -165,10 +166,21 @@ class Motion(SpecModel):
 
 
 @dataclass(frozen=True, slots=True)
+class RealTime(SpecModel):
+    """Beyond which a real-time run is invalid. late_share: of all control cycles, 0..1; late_worst_ns: of one cycle.
+
+    A run proves something only when nearly all cycles are on time. In lock-step none is ever late.
+    """
+
+    late_share: Share = 0.01
+    late_worst_ns: Annotated[Time, Field(alias="late_worst", json_schema_extra={"default": "20 ms"})] = 20 * MS
+
+
+@dataclass(frozen=True, slots=True)
 class Scenario(SpecModel):
     """One experiment. expect: what must hold besides no failure; fail_on: what fails the verdict.
 
-    tolerance_rad: how far beyond the range of travel is not yet a failure.
+    tolerance_rad: how far beyond the range of travel is not yet a failure; realtime: when a real-time run is invalid.
     """
 
     name: Annotated[str, BeforeValidator(_name)]
@@ -182,6 +194,7 @@ class Scenario(SpecModel):
     tolerance_rad: Annotated[
         Angle, AfterValidator(_tolerance), Field(alias="tolerance", json_schema_extra={"default": "0 deg"})
     ] = 0.0
+    realtime: RealTime = field(default_factory=RealTime)
 
     @property
     def plan(self) -> BusPlan:
@@ -208,9 +221,12 @@ def load_scenario(path: Path | str, overrides: Sequence[str] = ()) -> Scenario:
     return _read(document)
 
 
-def parse_scenario(text: str, source: str = "scenario") -> Scenario:
+def parse_scenario(text: str, source: str = "scenario", overrides: Sequence[str] = ()) -> Scenario:
     """As load_scenario, from text; `source` stands for the path in messages."""
-    return _read(parse(text, source))
+    document = parse(text, source)
+    for override in overrides:
+        apply_override(document, override)
+    return _read(document)
 
 
 def scenario_schema() -> dict[str, Data]:

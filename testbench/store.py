@@ -238,7 +238,8 @@ def _truth_writer(joints: tuple[str, ...], run: RunRecord) -> Writer:
 
 def _commands_writer(joints: tuple[str, ...], run: RunRecord) -> Writer:
     said = run.commands
-    columns = (("q_ref", "rad", said.q_ref), ("dq_ref", "rad/s", said.dq_ref), ("tau_command", "N m", said.tau_command))
+    reference = (("q_ref", "rad", said.q_ref), ("dq_ref", "rad/s", said.dq_ref)) if said.has_reference else ()
+    columns = (*reference, ("tau_command", "N m", said.tau_command))
     about = "high-level controller at its rate: reference angle and speed, torque command before the clamp"
     return lambda path: _write_parquet(path, joints, said.t_s, columns, about)
 

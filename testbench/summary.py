@@ -10,9 +10,10 @@ import platform
 from collections.abc import Sequence
 from importlib import metadata
 from math import isfinite
-from typing import Final, TypedDict
+from typing import Final, NotRequired, TypedDict
 
 from canopen_exo.bus.frame import Frame
+from canopen_exo.bus.lateness import LatenessDocument
 from canopen_exo.bus.node import NEVER
 from canopen_exo.bus.trace import candump_frame, trace_hash
 from fi_gateway.injector import Activation
@@ -122,8 +123,37 @@ class EventEntry(TypedDict):
     text: str
 
 
+class RealTimeRunEntry(TypedDict):
+    """One real-time run. lateness: of wake-ups, by process; latency: added by the gateway, by the bus it sent on."""
+
+    cycles: int
+    late_cycles: int
+    worst_late_ms: float
+    worst: str
+    lateness: dict[str, LatenessDocument]
+    latency: dict[str, LatenessDocument]
+
+
+class RealTimeLimitsEntry(TypedDict):
+    """Beyond these a real-time run is invalid."""
+
+    late_share: float
+    late_worst_ms: float
+
+
+class RealTimeEntry(TypedDict):
+    """How well a real-time pair of runs kept time; counts of both runs together, the worst of both."""
+
+    cycles: int
+    late_cycles: int
+    worst_late_ms: float
+    limits: RealTimeLimitsEntry
+    golden: RealTimeRunEntry
+    faulted: RealTimeRunEntry
+
+
 class Summary(TypedDict):
-    """The whole document."""
+    """The whole document. source: plant, or bus when foreign drives were on it; realtime: of a real-time run only."""
 
     scenario: str
     seed: int
@@ -149,6 +179,8 @@ class Summary(TypedDict):
     failures_at_3deg: list[ViolationEntry]
     expectations: list[ExpectationEntry]
     events: list[EventEntry]
+    source: str
+    realtime: NotRequired[RealTimeEntry]
     versions: dict[str, str]
 
 
@@ -207,6 +239,7 @@ def summary_document(
         "events": [
             {"time_s": one.time_s, "node": one.node, "kind": one.kind, "text": one.text} for one in faulted.notes
         ],
+        "source": faulted.source,
         "versions": versions(),
     }
     check_finite(document)
@@ -298,18 +331,17 @@ def _violations(found: Sequence[Violation]) -> list[ViolationEntry]:
 def summary_text(document: Summary) -> str:
     """The document for people: at most MOST_LINES lines of plain text for six joints, columns aligned."""
     load = ", ".join(f"{name} bus {100 * bus['load']:.0f} %" for name, bus in document["bus"].items())
-    golden = document["golden"]["tracking_rmse_rad"]
-    worst = max(golden, key=lambda joint: golden[joint])
     head = [
         f"{document['verdict'].upper()}  {document['scenario']}, seed {document['seed']}: {_outcome_text(document)}",
         f"      {document['sim_time_s']:.1f} s simulated in {document['wall_time_s']:.2f} s "
         f"({document['x_realtime']:.1f} x real time); {load}",
+        *_real_time_lines(document),
         *_few([f"      {reason}" for reason in document["invalid_reasons"]], 2, "reasons"),
         *_few([_event_line(event) for event in document["events"]], 3, "events"),
     ]
     tail = [
         *_joint_lines(document),
-        f"golden run: tracking RMSE at most {golden[worst]:.4f} rad ({worst})",
+        _tracking_line(document["golden"]["tracking_rmse_rad"]),
         *_few(_violation_lines("golden error", document["golden"]["errors"]), 2, "golden errors"),
         *_few(_violation_lines("failure", document["failures"]), 3, "failures"),
         *_few(_violation_lines("error", document["errors"]), 3, "errors"),
@@ -318,6 +350,26 @@ def summary_text(document: Summary) -> str:
     injections = _injection_lines(document)
     room = max(MOST_LINES - len(head) - len(tail) - 1, 1)
     return "\n".join([*head, injections[0], *_few(injections[1:], room, "injections"), *tail]) + "\n"
+
+
+def _real_time_lines(document: Summary) -> list[str]:
+    lines = []
+    timing = document.get("realtime")
+    if timing is not None:
+        lines.append(
+            f"      real time: {timing['late_cycles']} of {timing['cycles']} cycles late, "
+            f"the latest by {timing['worst_late_ms']:.1f} ms"
+        )
+    if document["source"] != "plant":
+        lines.append("      angles, speeds and torques are what the drives' frames said (source: bus)")
+    return lines
+
+
+def _tracking_line(golden: dict[str, float]) -> str:
+    if not golden:
+        return "golden run: tracking unknown, the controller is foreign"
+    worst = max(golden, key=lambda joint: golden[joint])
+    return f"golden run: tracking RMSE at most {golden[worst]:.4f} rad ({worst})"
 
 
 def _outcome_text(document: Summary) -> str:

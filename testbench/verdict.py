@@ -224,7 +224,7 @@ def quantities(
     failures: int,
     faulted: RunRecord,
 ) -> dict[str, float]:
-    """Everything an `expect:` line may name, in SI: rad, rad/s, N m, or a count.
+    """Everything an `expect:` line may name, in SI: rad, rad/s, N m, or a count. No tracking without a reference.
 
     `golden.tracking_rmse` is that of the worst joint; with `.right_knee` behind it, that of one joint.
     """
@@ -233,8 +233,9 @@ def quantities(
         "failures": float(failures),
         "injections": float(len(faulted.activations)),
         "completed": float(faulted.completed),
-        "golden.tracking_rmse": max(tracking_rmse_rad.values()),
     }
+    if tracking_rmse_rad:
+        found["golden.tracking_rmse"] = max(tracking_rmse_rad.values())
     for joint, value in tracking_rmse_rad.items():
         found[f"golden.tracking_rmse.{joint}"] = value
     for joint, one in comparison.items():

@@ -86,7 +86,7 @@ def test_defaults_are_written_into_the_resolved_file() -> None:
     """scenario.yaml as run says everything."""
     text = parse_scenario(PLAIN).resolved_yaml()
     assert [line.split(":")[0] for line in text.splitlines() if not line.startswith(" ")] == [
-        *("name", "description", "rig", "motion", "seed", "injectors", "expect", "fail_on", "tolerance"),
+        *("name", "description", "rig", "motion", "seed", "injectors", "expect", "fail_on", "tolerance", "realtime"),
     ]
     assert "  rate: 500 Hz\n" in text
     assert "  stops: 'on'\n" in text  # quoted: other YAML readers take a bare on for true
@@ -180,7 +180,7 @@ def test_a_bad_value_is_refused_at_its_line_and_column(old: str, new: str, place
     [
         ("", "s.yaml:1:1: the file is empty"),
         ("- a\n", "s.yaml:1:1: expected a mapping with name, rig, motion, description, seed, injectors, expect, "
-                  "fail_on, tolerance; got a list"),
+                  "fail_on, tolerance, realtime; got a list"),
         (PLAIN.replace("motion", "injectors: {}\n#"), "s.yaml:1:1: motion: missing; needed: name, rig, motion"),
         (PLAIN + "injectors:\n", "s.yaml:4:11: injectors: expected a mapping of names; got nothing"),
         (PLAIN + "injectors: [a]\n", "s.yaml:4:12: injectors: expected a mapping of names; got a list"),
@@ -273,7 +273,7 @@ def test_overrides_apply_in_order() -> None:
         ("seed", ": expected key=value, such as motion.duration=7s"),
         ("seed=x", ": expected a whole number 0..9223372036854775807; got 'x'"),
         ("sed=1", ": unknown key; did you mean 'seed'? (allowed: name, rig, motion, description, seed, injectors, "
-         "expect, fail_on, tolerance)"),
+         "expect, fail_on, tolerance, realtime)"),
     ],
 )  # fmt: skip
 def test_a_bad_override_is_reported_as_such(override: str, message: str) -> None:
@@ -397,3 +397,35 @@ def test_anything_in_a_file_is_a_scenario_or_a_clear_refusal(changes: list[tuple
     except FileErrors as error:
         said = str(error)
     assert not any(word in said for word in ("Input should", "pydantic", "dataclass", "Traceback", "_ns"))
+
+
+# --- real time -------------------------------------------------------------------------------------------------------
+
+
+def test_limits_of_real_time_are_one_percent_and_20_ms_unless_said() -> None:
+    """A real-time run is invalid beyond 1 % of late cycles, or one that is late by more than 20 ms."""
+    realtime = parse_scenario(PLAIN).realtime
+    assert (realtime.late_share, realtime.late_worst_ns) == (0.01, 20_000_000)
+    realtime = parse_scenario(PLAIN + "realtime: {late_share: 2.5 %, late_worst: 5 ms}\n").realtime
+    assert (realtime.late_share, realtime.late_worst_ns) == (0.025, 5_000_000)
+
+
+@pytest.mark.parametrize(
+    ("block", "words"),
+    [
+        ("{late_share: 1}", ""),
+        ("{late_share: 0, late_worst: 0 s}", ""),
+        ("{late_share: 101 %}", "allowed 0..1 or 0 %..100 %"),
+        ("{late_worst: 20}", "20 has no unit"),
+        ("{late_worst: -1 ms}", "negative"),
+        ("{late_most: 20 ms}", "unknown key"),
+    ],
+)
+def test_limits_of_real_time_are_checked(block: str, words: str) -> None:
+    """Dense at the boundaries; what is wrong is named with its place."""
+    text = f"{PLAIN}realtime: {block}\n"
+    if not words:
+        assert parse_scenario(parse_scenario(text).resolved_yaml()) == parse_scenario(text)
+        return
+    with pytest.raises(FileErrors, match=words):
+        parse_scenario(text)

@@ -1,0 +1,97 @@
+"""One real interface as the real-time loop sees it: frames and notices with a time, a way to send, nothing that blocks.
+
+A channel is a leaf: SocketCAN (`socketcan`), any python-can bus (`adapter`) or the hub's client. Its times are on the
+loop's clock: nanoseconds of CLOCK_MONOTONIC since `epoch_ns`, which the loop sets before its first call.
+Error frames never pass as frames: the channel turns them into PortState notices (`error_frame`), whose port is 0 until
+the loop puts in the node's own.
+Leaves out: hardware time stamps (an adapter's own clock is not the loop's).
+"""
+
+import time
+from typing import Final, final
+
+from mypy_extensions import mypyc_attr
+
+from canopen_exo.bus.frame import Frame
+from canopen_exo.bus.node import NEVER, PortState
+
+
+@final
+class Arrival:
+    """A frame that came, or a notice about the interface; exactly one of the two. stamp_ns: end of the frame."""
+
+    __slots__ = ("frame", "stamp_ns", "state")
+
+    def __init__(self, stamp_ns: int, frame: Frame | None, state: PortState | None) -> None:
+        self.stamp_ns: Final[int] = stamp_ns
+        self.frame: Final[Frame | None] = frame
+        self.state: Final[PortState | None] = state
+
+
+@mypyc_attr(allow_interpreted_subclasses=True)
+class Channel:
+    """One interface. Never blocks and, once open, never raises: what goes wrong becomes a notice and a count.
+
+    name: as on the command line, "socketcan:vcan0". epoch_ns: time 0 of its stamps on CLOCK_MONOTONIC.
+    overruns: frames the kernel or the hub says it dropped before we read them; malformed: records that are no frame.
+    errors: error frames seen; lost: frames given to `send` that the interface could not take (away, or refused).
+    poll_at: loop time [ns] at which `receive` is to be called though nothing is readable (to reopen, to hand out a
+    notice, or because the interface has no file descriptor); NEVER for none.
+    send_at: after a `send` that gave False, loop time [ns] of the next attempt; 0 for as soon as it is writable.
+    """
+
+    def __init__(self, name: str) -> None:
+        self.name: Final[str] = name
+        self.epoch_ns: int = 0
+        self.overruns: int = 0
+        self.malformed: int = 0
+        self.errors: int = 0
+        self.lost: int = 0
+        self.poll_at: int = NEVER
+        self.send_at: int = 0
+
+    def fileno(self) -> int:
+        """What select waits on; -1 while the interface is away or when it has no file descriptor."""
+        raise NotImplementedError
+
+    def receive(self) -> list[Arrival]:
+        """All that has come, oldest first: drained until it would block."""
+        raise NotImplementedError
+
+    def send(self, frame: Frame) -> bool:
+        """Hand a frame over. False: it would block now, offer it again; True: taken, or counted in `lost`."""
+        raise NotImplementedError
+
+    def close(self) -> None:
+        """Let the interface go; a second call does nothing."""
+        raise NotImplementedError
+
+
+@final
+class StampClock:
+    """Stamps of CLOCK_REALTIME (the kernel's, python-can's) on the loop's clock.
+
+    Both clocks are compared anew for every batch, so a corrected wall clock does no harm: a stamp lies between the
+    one before it and now, whatever the wall clock did meanwhile.
+    """
+
+    def __init__(self) -> None:
+        self._now: int = 0
+        self._offset: int = 0
+        self._last: int = -NEVER
+
+    def begin(self, epoch_ns: int) -> int:
+        """Compare the clocks; returns now on the loop's clock [ns]."""
+        self._now = time.monotonic_ns() - epoch_ns
+        self._offset = time.time_ns() - self._now
+        return self._now
+
+    def at(self, realtime_ns: int) -> int:
+        """A stamp of CLOCK_REALTIME [ns] on the loop's clock."""
+        stamp = realtime_ns - self._offset
+        if stamp > self._now:
+            stamp = self._now
+        if stamp < self._last:
+            stamp = self._last
+        self._last = stamp
+        return stamp

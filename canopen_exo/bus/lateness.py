@@ -1,0 +1,111 @@
+"""How late things were: a histogram with logarithmic bins that can be merged and written as JSON.
+
+Eight bins to the octave, in whole nanoseconds: a percentile is exact to 12.5 %, counts and the worst value are exact.
+"""
+
+from typing import Final, TypedDict, final
+
+from canopen_exo.errors import CanopenExoError
+
+_BINS: Final = 8 * 58 + 16
+"""Bins for all values below 2**62 ns."""
+
+_TOP_NS: Final = (1 << 62) - 1
+
+
+class LatenessDocument(TypedDict):
+    """As in JSON. bins: pairs of lower edge [ns] and count, the empty ones left out; percentiles in ns."""
+
+    count: int
+    worst_ns: int
+    p50_ns: int
+    p90_ns: int
+    p99_ns: int
+    p999_ns: int
+    bins: list[list[int]]
+
+
+@final
+class Lateness:
+    """A distribution of delays, ns. count: values so far; worst_ns: the largest, exact."""
+
+    def __init__(self) -> None:
+        self.count: int = 0
+        self.worst_ns: int = 0
+        self._bins: Final[list[int]] = [0] * _BINS
+
+    def add(self, delay_ns: int) -> None:
+        """Count one delay; a negative one counts as 0."""
+        if delay_ns < 0:
+            delay_ns = 0
+        if delay_ns > self.worst_ns:
+            self.worst_ns = delay_ns
+        self.count += 1
+        self._bins[_bin(delay_ns)] += 1
+
+    def percentile(self, share: float) -> int:
+        """The delay [ns] that at least `share` (0..1) of the values do not exceed: its bin's upper edge."""
+        if not 0.0 <= share <= 1.0:
+            raise CanopenExoError(f"lateness: percentile of share {share} asked for, allowed 0..1 (0.99 for 99 %)")
+        wanted = share * self.count
+        seen = 0
+        for index in range(_BINS):
+            seen += self._bins[index]
+            if seen and seen >= wanted:
+                return min(_lower(index + 1) - 1, self.worst_ns)
+        return 0
+
+    def merge(self, other: "Lateness") -> None:
+        """Add the values of `other` to these."""
+        self.count += other.count
+        self.worst_ns = max(self.worst_ns, other.worst_ns)
+        for index in range(_BINS):
+            self._bins[index] += other._bins[index]
+
+    def document(self) -> LatenessDocument:
+        """For JSON."""
+        bins = [[_lower(index), number] for index, number in enumerate(self._bins) if number]
+        return {
+            "count": self.count,
+            "worst_ns": self.worst_ns,
+            "p50_ns": self.percentile(0.5),
+            "p90_ns": self.percentile(0.9),
+            "p99_ns": self.percentile(0.99),
+            "p999_ns": self.percentile(0.999),
+            "bins": bins,
+        }
+
+    @staticmethod
+    def from_document(document: LatenessDocument) -> "Lateness":
+        """The distribution that `document` was made from; raises CanopenExoError when it is none."""
+        lateness = Lateness()
+        try:
+            for lower, number in document["bins"]:
+                if not (type(lower) is int and type(number) is int and 0 <= lower <= _TOP_NS and number >= 0):
+                    raise ValueError(f"bin {[lower, number]}")
+                lateness._bins[_bin(lower)] += number
+                lateness.count += number
+            lateness.worst_ns = int(document["worst_ns"])
+            if lateness.count != document["count"]:
+                raise ValueError(f"count {document['count']} beside bins that hold {lateness.count}")
+        except (KeyError, TypeError, ValueError) as error:
+            raise CanopenExoError(
+                f"lateness: no distribution: {error}; allowed is what Lateness.document() wrote"
+            ) from error
+        return lateness
+
+
+def _bin(value: int) -> int:
+    """0..15 have a bin each; from there eight bins to the octave."""
+    if value > _TOP_NS:
+        value = _TOP_NS
+    octave = max(value.bit_length() - 4, 0)
+    return (octave << 3) + (value >> octave)
+
+
+def _lower(index: int) -> int:
+    """The smallest value of a bin."""
+    if index < 16:
+        return index
+    octave = (index >> 3) - 1
+    return (index - (octave << 3)) << octave

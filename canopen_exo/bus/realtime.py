@@ -1,0 +1,393 @@
+"""The real-time loop: one process, one thread, one select, one node, on real interfaces.
+
+The node is the same as in lock-step. The loop's clock counts nanoseconds of CLOCK_MONOTONIC from an epoch that all
+processes of a rig share; only this module and the channels read it. Between two waits the loop
+
+1. drains every channel and serves what came in the order of (stamp, channel, order of arrival), each frame with
+   now = its stamp; wake-ups due before a stamp are served first, each with now = its `wake_at`;
+2. serves the wake-ups that are due; 3. delivers own frames to the node's other ports on a shared channel;
+4. sends what had to wait; 5. calls the further readers (live control).
+
+`now` never goes back for a frame: one whose stamp is older than what was served already gets that time (its trace row
+keeps the stamp). Deviation from the lock-step order: within one channel frames keep the order in which they came, also
+where stamps are equal; on a real bus no two frames end at once.
+Automatic garbage collection rests while the loop runs: one full collection over a long trace takes tens of
+milliseconds, and the core makes no reference cycles. The thread's timer slack is set to 1 us.
+Leaves out: signals (the caller's matter, `until` is asked at least every 50 ms), and when a sent frame really left
+the controller: its trace row has the time at which it was handed over.
+"""
+
+import gc
+import logging
+import select
+import time
+from collections.abc import Callable
+from typing import Final, Protocol, final
+
+from canopen_exo.bus.channel import Arrival, Channel
+from canopen_exo.bus.frame import Frame
+from canopen_exo.bus.lateness import Lateness
+from canopen_exo.bus.medium import QUEUE_LENGTH, Transmission
+from canopen_exo.bus.node import MS, NEVER, SECOND, ErrorState, Node, Out, PortState
+from canopen_exo.bus.scheduling import request_fifo, sharpen_timers
+from canopen_exo.errors import CanopenExoError
+
+__all__ = ["RECEIVED", "Lateness", "Readable", "RealTimeLoop", "RealTimeOut", "request_fifo"]
+
+RECEIVED: Final = -1
+"""`Transmission.sender` of a frame that came from outside; own frames have the node's port there."""
+
+_CHECK_NS: Final = 50 * MS
+"""`until` is asked at least this often."""
+
+_RETRY_NS: Final = MS
+"""How soon a frame is offered again to an interface that select cannot watch."""
+
+_LOG: Final = logging.getLogger(__name__)
+
+Wait = Callable[[list[int], list[int], float], tuple[list[int], list[int]]]
+"""Waits for descriptors to read, descriptors to write, at most some seconds; returns those that are ready."""
+
+
+class Readable(Protocol):
+    """Something select can wait for."""
+
+    def fileno(self) -> int:
+        """Its file descriptor."""
+
+
+@final
+class _Waiting:
+    """A frame that could not be sent yet. handled_ns: as `RealTimeOut.handled_ns` when it was given."""
+
+    __slots__ = ("frame", "handled_ns", "port")
+
+    def __init__(self, frame: Frame, port: int, handled_ns: int) -> None:
+        self.frame: Final[Frame] = frame
+        self.port: Final[int] = port
+        self.handled_ns: Final[int] = handled_ns
+
+
+@final
+class _Echo:
+    """A frame of ours on its way to the node's other port on the same channel."""
+
+    __slots__ = ("frame", "port", "sent_ns")
+
+    def __init__(self, sent_ns: int, port: int, frame: Frame) -> None:
+        self.sent_ns: Final[int] = sent_ns
+        self.port: Final[int] = port
+        self.frame: Final[Frame] = frame
+
+
+@final
+class _Line:
+    """A channel with the node's ports on it and the frames that wait for it, in the order in which they will go."""
+
+    __slots__ = ("channel", "fd", "index", "latency", "ports", "state", "waiting")
+
+    def __init__(self, index: int, channel: Channel) -> None:
+        self.index: Final[int] = index
+        self.channel: Final[Channel] = channel
+        self.ports: Final[list[int]] = []
+        self.waiting: Final[list[_Waiting]] = []
+        self.latency: Final[Lateness] = Lateness()
+        self.state: ErrorState = ErrorState.ERROR_ACTIVE
+        self.fd: int = -1
+
+
+@final
+class RealTimeOut(Out):
+    """The transmit side of the node. handled_ns: stamp of the frame being handled, NEVER outside of `receive`."""
+
+    def __init__(
+        self, clock: Callable[[], int], epoch_ns: int, trace: list[Transmission] | None, measure: bool
+    ) -> None:
+        self.lines: Final[list[_Line]] = []
+        self.echoes: list[_Echo] = []
+        self.dropped: Final[list[int]] = []
+        self.handled_ns: int = NEVER
+        self._clock: Final = clock
+        self._epoch_ns: Final[int] = epoch_ns
+        self._trace: Final = trace
+        self._measure: Final[bool] = measure
+
+    def send(self, port: int, frame: Frame) -> None:
+        """To the channel at once; into the queue of 64 while it would block; a full queue drops and counts it."""
+        line = self.lines[port]
+        if line.waiting or not self._try(line, port, frame, self.handled_ns):
+            waiting = line.waiting
+            at = len(waiting)
+            if at >= QUEUE_LENGTH:
+                self.dropped[port] += 1
+                return
+            arbitration = frame.arbitration
+            while at and waiting[at - 1].frame.arbitration > arbitration:
+                at -= 1
+            waiting.insert(at, _Waiting(frame, port, self.handled_ns))
+
+    def flush(self, line: _Line) -> None:
+        """Offer what waits, until it would block again."""
+        waiting = line.waiting
+        while waiting:
+            first = waiting[0]
+            if not self._try(line, first.port, first.frame, first.handled_ns):
+                return
+            waiting.pop(0)
+
+    def _try(self, line: _Line, port: int, frame: Frame, handled_ns: int) -> bool:
+        channel = line.channel
+        lost = channel.lost
+        if not channel.send(frame):
+            return False
+        if channel.lost != lost:
+            return True
+        shared = len(line.ports) > 1
+        if shared or self._measure or self._trace is not None:
+            now = self._clock() - self._epoch_ns
+            if self._trace is not None:
+                self._trace.append(Transmission(now, line.index, frame, port))
+            if self._measure and handled_ns != NEVER:
+                line.latency.add(now - handled_ns)
+            if shared:
+                self.echoes.append(_Echo(now, line.ports[1] if line.ports[0] == port else line.ports[0], frame))
+        return True
+
+
+def wait_select(readers: list[int], writers: list[int], timeout_s: float) -> tuple[list[int], list[int]]:
+    """The operating system's select; microseconds, where poll and epoll round up to milliseconds."""
+    if not readers and not writers:  # refused by select on Windows
+        time.sleep(timeout_s)
+        return [], []
+    readable, writable, _ = select.select(readers, writers, [], timeout_s)
+    return readable, writable
+
+
+@final
+class RealTimeLoop:
+    """Serves one node on real interfaces.
+
+    channels: the interfaces, numbers in the trace; ports[k]: index of the channel of the node's port k, several ports
+    may share one. epoch_ns: time 0 on CLOCK_MONOTONIC. record: keep the trace. measure_latency: keep `latency`.
+    clock, wait: for tests.
+    trace: every frame in the order served, received ones with their stamp and sender RECEIVED, own ones with the time
+    of sending and the node's port. lateness: time served - wake_at of every wake-up. dropped: frames a full transmit
+    queue refused, by port.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        channels: list[Channel],
+        ports: list[int],
+        epoch_ns: int,
+        *,
+        record: bool = False,
+        measure_latency: bool = False,
+        clock: Callable[[], int] = time.monotonic_ns,
+        wait: Wait = wait_select,
+    ) -> None:
+        for port, index in enumerate(ports):
+            if not 0 <= index < len(channels):
+                raise CanopenExoError(
+                    f"real-time loop: port {port} is to use channel {index}, allowed 0..{len(channels) - 1}; "
+                    "open a channel for it"
+                )
+        self.epoch_ns: Final[int] = epoch_ns
+        self.trace: Final[list[Transmission] | None] = [] if record else None
+        self.lateness: Final[Lateness] = Lateness()
+        self._node: Final[Node] = node
+        self._clock: Final = clock
+        self._wait: Final = wait
+        self._out: Final[RealTimeOut] = RealTimeOut(clock, epoch_ns, self.trace, measure_latency)
+        self._lines: Final[list[_Line]] = []
+        self._readers: Final[dict[int, Callable[[int], None]]] = {}
+        self._served: int = -NEVER
+        for index, channel in enumerate(channels):
+            channel.epoch_ns = epoch_ns
+            self._lines.append(_Line(index, channel))
+        for port, index in enumerate(ports):
+            self._lines[index].ports.append(port)
+            self._out.lines.append(self._lines[index])
+            self._out.dropped.append(0)
+        self.dropped: Final[list[int]] = self._out.dropped
+
+    @property
+    def latency(self) -> list[Lateness]:
+        """By channel sent on: time of sending - stamp of the frame that made the node send (not for wake-ups), ns."""
+        return [line.latency for line in self._lines]
+
+    def now(self) -> int:
+        """The loop's clock, ns."""
+        return self._clock() - self.epoch_ns
+
+    def losses(self) -> int:
+        """Frames lost so far, either way: in full queues, by the kernel or the hub, at an absent interface."""
+        lost = sum(self.dropped)
+        for line in self._lines:
+            lost += line.channel.overruns + line.channel.lost
+        return lost
+
+    def add_reader(self, source: Readable, callback: Callable[[int], None]) -> None:
+        """Call `callback(now)`, between two calls of the node, whenever `source` is readable."""
+        self._readers[source.fileno()] = callback
+
+    def remove_reader(self, source: Readable) -> None:
+        """Wait for `source` no longer; to be called before it is closed."""
+        self._readers.pop(source.fileno(), None)
+
+    def run(self, until: Callable[[int], bool]) -> None:
+        """Serve the node until `until(now)` is true. Channels stay open, they are the caller's."""
+        sharpen_timers()
+        collecting = gc.isenabled()
+        gc.disable()
+        try:
+            while not until(self.now()):
+                self._turn()
+        finally:
+            if collecting:
+                gc.enable()
+
+    def _turn(self) -> None:
+        """Wait once, then serve everything that is due."""
+        readers = list(self._readers)
+        writers: list[int] = []
+        timeout_ns = self._prepare(self.now(), readers, writers)
+        readable, writable = self._wait(readers, writers, timeout_ns / SECOND)
+        now = self.now()
+        self._serve_arrivals(now, readable)
+        self._serve_wakes(now)
+        if self._out.echoes:
+            self._serve_echoes()
+        for line in self._lines:
+            if line.waiting and (line.fd in writable or line.fd < 0 or 0 < line.channel.send_at <= now):
+                self._out.flush(line)
+        if self._readers:
+            for fd in readable:
+                callback = self._readers.get(fd)
+                if callback is not None:
+                    callback(self.now())
+
+    def _prepare(self, now: int, readers: list[int], writers: list[int]) -> int:
+        """Fill in what to wait for; returns for how long [ns]."""
+        at = now + _CHECK_NS
+        if self._node.wake_at < at:
+            at = self._node.wake_at
+        if self._out.echoes:
+            at = now
+        for line in self._lines:
+            channel = line.channel
+            fd = line.fd = channel.fileno()
+            if fd >= 0:
+                readers.append(fd)
+            if channel.poll_at < at:
+                at = channel.poll_at
+            if line.waiting:
+                send_at = channel.send_at
+                if send_at == 0 and fd >= 0:
+                    writers.append(fd)
+                else:
+                    at = min(at, send_at if send_at > now else now + _RETRY_NS)
+        return at - now if at > now else 0
+
+    def _serve_arrivals(self, now: int, readable: list[int]) -> None:
+        """Drain the channels that have something and serve it in order."""
+        first: list[Arrival] = []
+        first_line = -1
+        batches: list[tuple[int, int, int, Arrival]] = []
+        for line in self._lines:
+            channel = line.channel
+            if (line.fd >= 0 and line.fd in readable) or channel.poll_at <= now:
+                arrivals = channel.receive()
+                if not arrivals:
+                    continue
+                if first_line < 0:  # one channel alone needs no merging
+                    first = arrivals
+                    first_line = line.index
+                    continue
+                if not batches:
+                    _number(batches, first_line, first)
+                _number(batches, line.index, arrivals)
+        if first_line < 0:
+            return
+        latest = self.now()
+        if batches:
+            batches.sort()
+            for _, index, _, arrival in batches:
+                self._deliver(self._lines[index], arrival, latest)
+        else:
+            line = self._lines[first_line]
+            for arrival in first:
+                self._deliver(line, arrival, latest)
+
+    def _deliver(self, line: _Line, arrival: Arrival, latest: int) -> None:
+        """Give one arrival to the node. latest: no stamp counts as later than this, the time at which all had come."""
+        now = arrival.stamp_ns
+        if now > latest:
+            now = latest
+        if now < self._served:
+            now = self._served
+        if self._node.wake_at < now:
+            self._serve_wakes(now - 1)
+        self._served = now
+        frame = arrival.frame
+        if frame is not None:
+            if self.trace is not None:
+                self.trace.append(Transmission(arrival.stamp_ns, line.index, frame, RECEIVED))
+            if line.ports:
+                self._out.handled_ns = arrival.stamp_ns
+                self._node.receive(now, line.ports[0], frame, self._out)
+                self._out.handled_ns = NEVER
+        elif arrival.state is not None:
+            self._notify(line, arrival.state, now)
+
+    def _notify(self, line: _Line, state: PortState, now: int) -> None:
+        """Every port of the node on this channel shares its state."""
+        changed = state.state is not line.state
+        line.state = state.state
+        _LOG.log(
+            logging.WARNING if changed else logging.DEBUG,
+            "%s: %s (TEC %d, REC %d): %s",
+            line.channel.name,
+            state.state.value.replace("_", " "),
+            state.tec,
+            state.rec,
+            state.cause,
+        )
+        for port in line.ports:
+            self._node.port_changed(now, PortState(port, state.state, state.tec, state.rec, state.cause), self._out)
+
+    def _serve_wakes(self, limit: int) -> None:
+        """Serve every wake-up due up to and including `limit`."""
+        node = self._node
+        at = node.wake_at
+        while at <= limit:
+            self.lateness.add(self.now() - at)
+            if at > self._served:
+                self._served = at
+            node.wake(at, self._out)
+            if node.wake_at <= at:
+                raise CanopenExoError(
+                    f"real-time loop: {type(node).__name__} woken at {at} ns asks to be woken at {node.wake_at} ns; "
+                    "wake() must move wake_at on"
+                )
+            at = node.wake_at
+
+    def _serve_echoes(self) -> None:
+        """Own frames to the other ports; what those send in turn waits for the next turn."""
+        echoes = self._out.echoes
+        self._out.echoes = []
+        for echo in echoes:
+            now = max(echo.sent_ns, self._served)
+            self._serve_wakes(now - 1)
+            self._served = now
+            self._node.receive(now, echo.port, echo.frame, self._out)
+
+
+def _number(batches: list[tuple[int, int, int, Arrival]], index: int, arrivals: list[Arrival]) -> None:
+    """Add one channel's arrivals with what they are sorted by; a stamp that goes back counts as the one before it."""
+    stamp = -NEVER
+    for order, arrival in enumerate(arrivals):
+        if arrival.stamp_ns > stamp:
+            stamp = arrival.stamp_ns
+        batches.append((stamp, index, order, arrival))

@@ -1,0 +1,320 @@
+"""Linux SocketCAN, straight on the socket: CAN_RAW, classical and FD frames, kernel time stamps, error frames on.
+
+Source: the kernel's Documentation/networking/can.rst; linux/can.h, linux/can/raw.h; socket(7). Records are the kernel's
+structures: can_frame (16 bytes) and canfd_frame (72 bytes), in the machine's byte order.
+A frame costs one recvmsg and one send, a drained interface one more recvmsg; select is the loop's.
+An interface that goes down is reported, what is sent meanwhile is lost and counted, and the socket lives on by itself;
+one that disappears is opened again with a back-off of 20 ms to 1 s.
+Leaves out: setting the bit rate and bringing interfaces up (`ip link`), filters in the kernel, hardware time stamps.
+"""
+
+import contextlib
+import errno
+import socket
+import struct
+import time
+from collections.abc import Callable
+from typing import Final, final
+
+from canopen_exo.bus.channel import Arrival, Channel, StampClock
+from canopen_exo.bus.error_frame import ERROR_FLAG, read_error_frame
+from canopen_exo.bus.frame import FLAG_BRS, FLAG_ESI, FLAG_EXTENDED, FLAG_FD, FLAG_REMOTE, Frame
+from canopen_exo.bus.node import MS, NEVER, SECOND, ErrorState, PortState
+from canopen_exo.errors import CanopenExoError
+
+CLASSICAL_SIZE: Final = 16
+FD_SIZE: Final = 72
+
+_EXTENDED: Final = 0x80000000  # CAN_EFF_FLAG
+_REMOTE: Final = 0x40000000  # CAN_RTR_FLAG
+_FD_BRS: Final = 1  # CANFD_BRS
+_FD_ESI: Final = 2  # CANFD_ESI
+_FD_FDF: Final = 4  # CANFD_FDF
+_FD_LENGTHS: Final = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
+
+_HEAD: Final = struct.Struct("=IBBBB")  # id and flags, length, FD flags, reserved, len8_dlc
+_HEAD_SIZE: Final = 8
+
+# Not all of these are in Python's socket module; the values are those of asm-generic/socket.h (all but alpha, mips,
+# parisc and sparc) and linux/can/raw.h.
+_SO_RCVBUFFORCE: Final = 33
+_SO_TIMESTAMP: Final = 29
+_SO_TIMESTAMPNS: Final = 35
+_SO_RXQ_OVFL: Final = 40
+_SOL_CAN_RAW: Final = 101
+_CAN_RAW_ERR_FILTER: Final = 2
+_CAN_RAW_FD_FRAMES: Final = 5
+_CAN_ERR_MASK: Final = 0x1FFFFFFF
+
+_TIME: Final = struct.Struct("@ll")  # timespec or timeval
+_COUNT: Final = struct.Struct("@I")
+_ANCILLARY: Final = 64
+"""Bytes for control messages: stamp (16 + 16) and drop count (16 + 8)."""
+
+_RECEIVE_BUFFER: Final = 8 << 20
+"""Bytes asked for; the kernel counts about 0.8 kB a frame: a second of a full bus, where it grants all of it."""
+
+_SEND_BUFFER: Final = 1
+"""Asks for the kernel's minimum (4.6 kB, some six frames on their way): a full bus then shows as "not writable" before
+the interface's own queue is full (txqueuelen, 10 by default), for which select cannot wait."""
+
+_BATCH: Final = 256
+"""Frames read at a time; a flood must not keep the loop from its wake-ups."""
+
+_AGAIN_NS: Final = MS // 4
+"""When an interface's queue was full (ENOBUFS): two frame times at 1 Mbit/s."""
+
+_FIRST_BACK_OFF_NS: Final = 20 * MS
+_LAST_BACK_OFF_NS: Final = SECOND
+
+_GONE: Final = (errno.ENODEV, errno.ENXIO, errno.EBADF, errno.ENOTCONN)
+
+
+def encode(frame: Frame) -> bytes:
+    """The kernel's record of a frame: 16 bytes, or 72 for CAN FD."""
+    flags = frame.flags
+    data = frame.data
+    if flags == 0:
+        raw = frame.dlc
+        return _HEAD.pack(frame.can_id, len(data), 0, 0, raw if raw > 8 else 0) + data.ljust(8, b"\0")
+    can_id = frame.can_id
+    if flags & FLAG_EXTENDED:
+        can_id |= _EXTENDED
+    if flags & FLAG_FD:
+        fd_flags = _FD_FDF | (_FD_BRS if flags & FLAG_BRS else 0) | (_FD_ESI if flags & FLAG_ESI else 0)
+        return _HEAD.pack(can_id, len(data), fd_flags, 0, 0) + data.ljust(64, b"\0")
+    dlc = frame.dlc
+    if flags & FLAG_REMOTE:
+        can_id |= _REMOTE
+    return _HEAD.pack(can_id, dlc if dlc <= 8 else 8, 0, 0, dlc if dlc > 8 else 0) + data.ljust(8, b"\0")
+
+
+def decode(record: bytes) -> Frame | None:
+    """The frame in a kernel's record; None for bytes that are none, and for error frames (see `read_error_frame`)."""
+    size = len(record)
+    if size != CLASSICAL_SIZE and size != FD_SIZE:
+        return None
+    can_id, length, fd_flags, _, raw = _HEAD.unpack_from(record)
+    if size == CLASSICAL_SIZE and can_id <= 0x7FF and length <= 8 and raw <= 8:  # the frames of nearly every cycle
+        return Frame(can_id, record[_HEAD_SIZE : _HEAD_SIZE + length])
+    if can_id & ERROR_FLAG:
+        return None
+    flags = 0
+    if can_id & _EXTENDED:
+        flags = FLAG_EXTENDED
+    number = can_id & (0x1FFFFFFF if flags else 0x7FF)
+    if size == FD_SIZE:
+        if length > 64:
+            return None
+        flags |= FLAG_FD | (FLAG_BRS if fd_flags & _FD_BRS else 0) | (FLAG_ESI if fd_flags & _FD_ESI else 0)
+        for allowed in _FD_LENGTHS:  # any other length was padded with zeros by whoever put it on a wire
+            if allowed >= length:
+                length = allowed
+                break
+        return Frame(number, record[_HEAD_SIZE : _HEAD_SIZE + length], flags)
+    if length > 8:
+        return None
+    dlc = raw if length == 8 and 9 <= raw <= 15 else length
+    if can_id & _REMOTE:
+        return Frame(number, b"", flags | FLAG_REMOTE, dlc)
+    return Frame(number, record[_HEAD_SIZE : _HEAD_SIZE + length], flags, dlc)
+
+
+def open_can_socket(interface: str) -> socket.socket:
+    """A bound CAN_RAW socket. Raises OSError; `interface_error` says what to do about it."""
+    if not hasattr(socket, "AF_CAN"):
+        raise OSError(errno.EAFNOSUPPORT, "this Python knows no AF_CAN")
+    can = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
+    try:
+        can.setsockopt(_SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, _CAN_ERR_MASK)
+        with contextlib.suppress(OSError):  # a kernel older than 3.6: no FD
+            can.setsockopt(_SOL_CAN_RAW, _CAN_RAW_FD_FRAMES, 1)
+        can.bind((interface,))
+    except OSError:
+        can.close()
+        raise
+    return can
+
+
+def prepare_socket(can: socket.socket) -> None:
+    """Never block; stamps and drop counts with every message; a large receive buffer, a small send buffer."""
+    can.setblocking(False)
+    try:
+        can.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, _RECEIVE_BUFFER)  # beyond net.core.rmem_max: root only
+    except OSError:
+        can.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
+    can.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
+    try:
+        can.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+    except OSError:
+        can.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMP, 1)
+    with contextlib.suppress(OSError):  # without it overruns stay unseen
+        can.setsockopt(socket.SOL_SOCKET, _SO_RXQ_OVFL, 1)
+
+
+def interface_error(name: str, interface: str, error: OSError) -> CanopenExoError:
+    """One line: what is missing and what to run."""
+    if error.errno in (errno.EAFNOSUPPORT, errno.EPROTONOSUPPORT, errno.ESOCKTNOSUPPORT):
+        remedy = "run `sudo modprobe can-raw` where the kernel has it, or use the emulated bus, `hub:`"
+        return CanopenExoError(f"bus {name}: this machine has no SocketCAN ({error.strerror}); {remedy}")
+    if error.errno in (errno.ENODEV, errno.ENXIO):
+        if interface.startswith("vcan"):
+            make = f"sudo modprobe vcan && sudo ip link add dev {interface} type vcan"
+        else:
+            make = f"sudo ip link set {interface} type can bitrate 1000000"
+        remedy = f"`{make} && sudo ip link set {interface} up`; `ip link` lists what there is"
+        return CanopenExoError(f"bus {name}: there is no CAN interface {interface!r}; run {remedy}")
+    if error.errno in (errno.EPERM, errno.EACCES):
+        return CanopenExoError(
+            f"bus {name}: no right to open a CAN socket ({error.strerror}); run as root, or in a container with "
+            "`--cap-add=NET_RAW --network=host`"
+        )
+    return CanopenExoError(f"bus {name}: interface {interface!r} cannot be opened: {error.strerror or error}")
+
+
+@final
+class SocketCanChannel(Channel):
+    """One SocketCAN interface. open_socket: gives a socket whose messages are the kernel's CAN records.
+
+    The socket is opened at once; OSError passes to the caller then, later failures become notices.
+    """
+
+    def __init__(self, name: str, open_socket: Callable[[], socket.socket]) -> None:
+        super().__init__(name)
+        self._open_socket: Final = open_socket
+        self._stamps: Final = StampClock()
+        self._notices: list[PortState] = []
+        self._state: PortState | None = None
+        self._is_down: bool = False
+        self._is_closed: bool = False
+        self._drops: int = 0
+        self._back_off_ns: int = _FIRST_BACK_OFF_NS
+        self._socket: socket.socket | None = open_socket()
+        prepare_socket(self._socket)
+
+    def fileno(self) -> int:
+        """The socket; -1 while the interface is away."""
+        return -1 if self._socket is None else self._socket.fileno()
+
+    def receive(self) -> list[Arrival]:
+        """What the kernel holds, at most 256 frames at once (the rest stays readable); opens again what was away."""
+        now = self._stamps.begin(self.epoch_ns)
+        arrivals: list[Arrival] = []
+        if self._socket is None and not self._is_closed:
+            self._reopen(now)
+        can = self._socket
+        if can is not None:
+            try:
+                for _ in range(_BATCH):
+                    record, ancillary, _, _ = can.recvmsg(FD_SIZE, _ANCILLARY)
+                    self._take(record, ancillary, now, arrivals)
+            except BlockingIOError:
+                pass
+            except OSError as error:
+                self._fail(error, now)
+        if self._notices:
+            self._hand_out(now, arrivals)
+        if self._socket is not None:
+            self.poll_at = NEVER
+        return arrivals
+
+    def send(self, frame: Frame) -> bool:
+        """Hand a frame to the kernel; False when its queue is full."""
+        can = self._socket
+        if can is None:
+            self.lost += 1
+            return True
+        try:
+            can.send(encode(frame))
+        except BlockingIOError:
+            self.send_at = 0
+            return False
+        except OSError as error:
+            now = time.monotonic_ns() - self.epoch_ns
+            if error.errno == errno.ENOBUFS:
+                self.send_at = now + _AGAIN_NS
+                return False
+            self.lost += 1
+            self._fail(error, now)
+            return True
+        if self._is_down:
+            self._note(ErrorState.ERROR_ACTIVE, "interface up", time.monotonic_ns() - self.epoch_ns)
+        return True
+
+    def close(self) -> None:
+        """Close the socket for good."""
+        self._is_closed = True
+        self.poll_at = NEVER
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+
+    def _take(self, record: bytes, ancillary: list[tuple[int, int, bytes]], now: int, arrivals: list[Arrival]) -> None:
+        """One message from the kernel."""
+        stamp = now
+        for _, kind, content in ancillary:
+            if kind == _SO_TIMESTAMPNS:
+                seconds, nanos = _TIME.unpack_from(content)
+                stamp = self._stamps.at(seconds * SECOND + nanos)
+            elif kind == _SO_TIMESTAMP:
+                seconds, micros = _TIME.unpack_from(content)
+                stamp = self._stamps.at(seconds * SECOND + micros * 1000)
+            elif kind == _SO_RXQ_OVFL:
+                drops = _COUNT.unpack_from(content)[0]
+                self.overruns += (drops - self._drops) & 0xFFFFFFFF
+                self._drops = drops
+        if self._is_down:
+            self._note(ErrorState.ERROR_ACTIVE, "interface up", now)
+            self._hand_out(stamp, arrivals)
+        frame = decode(record)
+        if frame is not None:
+            arrivals.append(Arrival(stamp, frame, None))
+            return
+        if len(record) == CLASSICAL_SIZE:
+            can_id = _HEAD.unpack_from(record)[0]
+            if can_id & ERROR_FLAG:
+                self.errors += 1
+                self._state = read_error_frame(can_id, record[_HEAD_SIZE:], self._state)
+                arrivals.append(Arrival(stamp, None, self._state))
+                return
+        self.malformed += 1
+
+    def _fail(self, error: OSError, now: int) -> None:
+        """The socket reported `error`: down, gone, or a frame that this interface refuses (counted by the caller)."""
+        if error.errno == errno.ENETDOWN:
+            self._note(ErrorState.DOWN, "interface down", now)
+        elif error.errno in _GONE:
+            self._note(ErrorState.DOWN, "interface gone", now)
+            if self._socket is not None:
+                self._socket.close()
+                self._socket = None
+            self._back_off_ns = _FIRST_BACK_OFF_NS
+            self.poll_at = now
+
+    def _note(self, state: ErrorState, cause: str, now: int) -> None:
+        """Tell the node with the next `receive`, which is asked for at once."""
+        is_down = state is ErrorState.DOWN
+        if self._is_down and is_down:
+            return
+        self._is_down = is_down
+        self._state = PortState(0, state, 0, 0, cause)
+        self._notices.append(self._state)
+        self.poll_at = now
+
+    def _hand_out(self, stamp: int, arrivals: list[Arrival]) -> None:
+        """The notices so far, as arrivals."""
+        for state in self._notices:
+            arrivals.append(Arrival(stamp, None, state))
+        self._notices = []
+
+    def _reopen(self, now: int) -> None:
+        """Try once; the next attempt comes after a longer time."""
+        try:
+            can = self._open_socket()
+            prepare_socket(can)
+        except OSError:
+            self.poll_at = now + self._back_off_ns
+            self._back_off_ns = min(2 * self._back_off_ns, _LAST_BACK_OFF_NS)
+            return
+        self._socket = can
+        self._drops = 0

@@ -1,0 +1,284 @@
+"""Live control: what people, scripts and devices may do to a running gateway, between two frames.
+
+docs/live_control.md has the words and their exact meaning. Each call is a row, also one that is refused. A call at
+`now` first settles everything that was due before; what was due while an injector was disarmed is not made up for.
+A local socket (`control_socket`) and a pair of CAN frames (`bus_control`) come here; nothing else listens.
+Leaves out: changing the parameters of an injector.
+"""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, final
+
+from canopen_exo.bus.lateness import Lateness
+from canopen_exo.bus.node import NEVER
+from fi_gateway.errors import FaultError
+from fi_gateway.gateway import CONTROLLER_PORT, DRIVE_PORT, Gateway
+from fi_gateway.injector import ACTIVE, ARMED, INERT, SPENT, WAITING, Injector
+
+if TYPE_CHECKING:  # pydantic
+    from fi_gateway.addition import Additions
+
+ARM: Final = "arm"
+DISARM: Final = "disarm"
+TRIGGER: Final = "trigger"
+START: Final = "start"
+STOP: Final = "stop"
+RESUME: Final = "resume"
+ADD: Final = "add"
+
+WORDS: Final = (ARM, DISARM, TRIGGER, START, STOP, RESUME)
+NAMED: Final = (ARM, DISARM, TRIGGER)
+"""The words that are about one injector; the others are about the gateway."""
+
+DISARMED: Final = "disarmed"
+HELD: Final = "held"
+
+
+@dataclass(frozen=True, slots=True)
+class ControlRow:
+    """One call. time_ns: loop clock; name: the injector, "" for all; source: "call", "socket", "bus 0x6c0", "signal".
+
+    refused: why nothing was done, "" when it was.
+    """
+
+    time_ns: int
+    what: str
+    name: str
+    source: str
+    refused: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class InjectorRow:
+    """One line of the listing. state: a Phase's word, DISARMED, or HELD while injection is stopped.
+
+    next_ns: when it acts by itself next (event, or end of the window), loop clock, NEVER for not at all.
+    """
+
+    name: str
+    state: str
+    next_ns: int
+    activated: int
+    injected: int
+    manifested: int
+
+
+@final
+class LiveControl:
+    """Live control of one gateway. rows: every call; stopped: nothing is injected until `resume`.
+
+    source, in every call: where it came from. Raises FaultError for a name that there is not, naming those there are,
+    and for what the injector's state does not allow, with the remedy.
+    additions: reads what `add` is given; None for a gateway that takes nothing new.
+    """
+
+    def __init__(self, gateway: Gateway, additions: "Additions | None" = None) -> None:
+        self.gateway: Final[Gateway] = gateway
+        self._additions: Final = additions
+        self.rows: Final[list[ControlRow]] = []
+        self.stopped: bool = False
+        self._held: Final[list[Injector]] = []
+
+    def arm(self, name: str, now: int, source: str = "call") -> None:
+        """Let the injector wait for its event and trigger, also one disabled in the file, or spent.
+
+        While injection is stopped it is armed by `resume`; before time 0 it waits for that.
+        """
+        injector = self._find(name, ARM, now, source)
+        self.gateway.settle(now - 1)
+        if not self.stopped:
+            injector.arm(now)
+        elif injector not in self._held:
+            self._held.append(injector)
+        self._done(now, ARM, name, source)
+
+    def disarm(self, name: str, now: int, source: str = "call") -> None:
+        """Close the injector's window, if it is open, and open none until it is armed."""
+        injector = self._find(name, DISARM, now, source)
+        self.gateway.settle(now - 1)
+        injector.disarm(now)
+        if injector in self._held:
+            self._held.remove(injector)
+        self._done(now, DISARM, name, source)
+
+    def trigger(self, name: str, now: int, source: str = "call") -> bool:
+        """Open the window of an armed injector now, with all that it triggers.
+
+        False: ignored, because it is active or waits for a value already (as a trigger in the file would be).
+        """
+        injector = self._find(name, TRIGGER, now, source)
+        self.gateway.settle(now)
+        if injector.phase is ACTIVE or injector.phase is WAITING:
+            self.rows.append(ControlRow(now, TRIGGER, name, source, f"ignored: {injector.phase.value} already"))
+            return False
+        if injector.phase is not ARMED:
+            raise self._refused(now, TRIGGER, name, source, self._why_not(injector))
+        self.gateway.fire(injector, now)
+        self._done(now, TRIGGER, name, source)
+        return True
+
+    def start(self, now: int, source: str = "call") -> None:
+        """Time 0 is now, for a rig whose master does not say it on the bus. Refused when it is known already."""
+        zero = self.gateway.time_zero
+        if zero != NEVER:
+            why = f"time 0 is known already, since {(now - zero) / 1e9:.3f} s, and does not move; restart the gateway"
+            raise self._refused(now, START, "", source, why)
+        self.gateway.settle(now - 1)
+        self.gateway.begin(now)
+        self._done(now, START, "", source)
+
+    def pass_through(self, now: int, source: str = "call") -> None:
+        """Stop injecting: close all windows, and pass every frame on until `resume`."""
+        self.gateway.settle(now - 1)
+        if not self.stopped:
+            self.stopped = True
+            for injector in self.gateway.injectors:
+                if injector.enabled and injector.phase is not SPENT:
+                    injector.disarm(now)
+                    self._held.append(injector)
+        self._done(now, STOP, "", source)
+
+    def resume(self, now: int, source: str = "call") -> None:
+        """Inject again: arm what `pass_through` held back. A window without end that it closed is over: spent."""
+        self.gateway.settle(now - 1)
+        if self.stopped:
+            self.stopped = False
+            for injector in self._held:
+                if injector.phase is SPENT:
+                    injector.enabled = True
+                else:
+                    injector.arm(now)
+            self._held.clear()
+        self._done(now, RESUME, "", source)
+
+    def add(self, name: str, given: object, now: int, source: str = "call", at_once: bool = False) -> None:
+        """One more injector, behind the others, see `Gateway.add`. given: its keys, as in a scenario file."""
+        try:
+            if self._additions is None:
+                raise FaultError("add: this gateway takes no injectors while it runs; give them in its scenario")
+            if self.stopped:
+                raise FaultError("add: injection is stopped; resume it first")
+            self._additions.extend(self.gateway, name, given, now, at_once)
+        except FaultError as error:
+            self.rows.append(ControlRow(now, ADD, name, source, str(error)))
+            raise
+        self._done(now, ADD, name, source)
+
+    def listing(self) -> list[InjectorRow]:
+        """The injectors as they are, in written order."""
+        return [
+            InjectorRow(one.name, self._state(one), one.next_ns, one.activated, one.injected, one.manifested)
+            for one in self.gateway.injectors
+        ]
+
+    def _state(self, injector: Injector) -> str:
+        """As in the listing."""
+        if injector in self._held:
+            return HELD
+        if not injector.enabled:
+            return DISARMED
+        return injector.phase.value
+
+    def _why_not(self, injector: Injector) -> str:
+        """Why an injector that is not armed cannot be triggered, and what to do."""
+        if self.stopped:
+            return "injection is stopped; resume it first"
+        if injector.phase is INERT and injector.enabled:
+            what = "the first frame" if injector.from_power_up else "time 0: the controller's status frame, or start"
+            return f"it waits for {what}"
+        return f"it is {self._state(injector)}; arm it first"
+
+    def _find(self, name: str, what: str, now: int, source: str) -> Injector:
+        for injector in self.gateway.injectors:
+            if injector.name == name:
+                return injector
+        known = ", ".join(injector.name for injector in self.gateway.injectors)
+        why = f"no such injector; allowed: {known}" if known else "this gateway has no injectors"
+        raise self._refused(now, what, name, source, why)
+
+    def _refused(self, now: int, what: str, name: str, source: str, why: str) -> FaultError:
+        """The error to raise; its row is left here."""
+        self.rows.append(ControlRow(now, what, name, source, why))
+        return FaultError(f"{what} {name!r}: {why}" if name else f"{what}: {why}")
+
+    def _done(self, now: int, what: str, name: str, source: str) -> None:
+        self.gateway.settle(now)
+        self.rows.append(ControlRow(now, what, name, source))
+
+
+def perform(control: LiveControl, word: str, name: str, now: int, source: str) -> bool:
+    """Do one of WORDS; name: only for those in NAMED. False: ignored. Raises FaultError."""
+    if word == TRIGGER:
+        return control.trigger(name, now, source)
+    if word == ARM:
+        control.arm(name, now, source)
+    elif word == DISARM:
+        control.disarm(name, now, source)
+    elif word == START:
+        control.start(now, source)
+    elif word == STOP:
+        control.pass_through(now, source)
+    elif word == RESUME:
+        control.resume(now, source)
+    else:
+        raise FaultError(f"live control: {word!r} given, allowed: {', '.join(WORDS)}")
+    return True
+
+
+@dataclass(frozen=True, slots=True)
+class Direction:
+    """What went one way through a gateway, in frames.
+
+    lost: by a fault; undelivered: not offered, because the interface they were for was away; notices: error notices of
+    the interface they came in on; latency: from the stamp of a frame to its sending [ns], None when not measured.
+    """
+
+    direction: str
+    frames: int
+    lost: int
+    undelivered: int
+    notices: int
+    latency: Lateness | None
+
+
+def statistics(gateway: Gateway, latency: list[Lateness] | None) -> list[Direction]:
+    """To the drives, then to the controller. latency: by port sent on, as the real-time loop measures it."""
+    return [
+        Direction(
+            name,
+            gateway.frames[port],
+            gateway.lost[port],
+            gateway.undelivered[port],
+            gateway.notices[port],
+            None if latency is None else latency[1 - port],
+        )
+        for port, name in ((CONTROLLER_PORT, "to_drives"), (DRIVE_PORT, "to_controller"))
+    ]
+
+
+def statistics_text(directions: list[Direction]) -> str:
+    """One line for each direction, for people."""
+    lines = []
+    for one in directions:
+        parts = [f"{one.direction}: {one.frames} frames, {one.lost} lost by faults"]
+        if one.undelivered:
+            parts.append(f"{one.undelivered} not delivered")
+        if one.notices:
+            parts.append(f"{one.notices} error notices")
+        late = one.latency
+        if late is not None and late.count:
+            median, most, worst = late.percentile(0.5) / 1e3, late.percentile(0.99) / 1e3, late.worst_ns / 1e3
+            parts.append(f"added latency: median {median:.0f} us, 99 % {most:.0f} us, worst {worst:.0f} us")
+        lines.append(", ".join(parts))
+    return "\n".join(lines)
+
+
+def listing_text(rows: list[InjectorRow], now: int) -> str:
+    """One line for each injector, for people. now: loop clock, ns."""
+    width = max((len(row.name) for row in rows), default=0)
+    lines = []
+    for row in rows:
+        counts = f"{row.activated} activations, {row.injected} frames acted on, {row.manifested} changed"
+        due = "" if row.next_ns >= NEVER else f"; next in {(row.next_ns - now) / 1e9:.3f} s"
+        lines.append(f"{row.name:{width}}  {row.state:8}  {counts}{due}")
+    return "\n".join(lines) or "no injectors"

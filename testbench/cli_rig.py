@@ -1,0 +1,279 @@
+"""The verbs of the command line that run against the clock: the processes of a rig, and `up`, which runs them all.
+
+Nothing heavy is imported before a verb needs it.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, Protocol
+
+from testbench.errors import BenchError
+
+if TYPE_CHECKING:
+    from testbench.process import ProcessOptions
+    from testbench.scenario import Scenario
+
+PASS: Final = 0
+USAGE: Final = 2
+INVALID: Final = 3
+
+PARTS: Final = ("joints", "gateway", "hlc")
+
+CONTROL_ADDRESS: Final = "127.0.0.1:29537"
+NAMED: Final = ("arm", "disarm", "trigger")
+UNNAMED: Final = ("start", "stop", "resume")
+"""Words of live control; a test holds that they are those of the gateway."""
+
+DEFAULT_SCENARIO: Final = """\
+name: rig
+description: the default rig, walking
+rig: {plant: suspended, stops: off, rate: 500 Hz}
+motion: {gait: walking, stride: 1.5 s, duration: 7 s}
+"""
+"""What the processes run without a scenario file."""
+
+_BUS_HELP: Final = "INTERFACE:CHANNEL[@bitrate], such as socketcan:can0 or hub:127.0.0.1:29536/drive"
+
+
+class Verbs(Protocol):
+    """Where verbs are added: what argparse's add_subparsers returns."""
+
+    def add_parser(self, name: str, *, help: str, description: str | None) -> argparse.ArgumentParser:
+        """A parser for one verb."""
+
+
+def add_verbs(verbs: Verbs) -> None:
+    """Add the verbs of this module."""
+    up = verbs.add_parser("up", help="the whole rig as real-time processes until Ctrl-C", description=_up.__doc__)
+    _add_scenario(up)
+    add_rig_options(up)
+    up.add_argument(
+        "--listen", metavar="HOST:PORT", default="127.0.0.1:29536", help="of the own hub (default: %(default)s)"
+    )
+    up.add_argument(
+        "--control", metavar="ADDRESS", default=CONTROL_ADDRESS, help="of the gateway (default: %(default)s)"
+    )
+    up.add_argument("--no-faults", action="store_true", help="without the scenario's injectors")
+    up.set_defaults(verb=_up)
+
+    joints = verbs.add_parser("joints", help="six drives on their plant, one process", description=_joints.__doc__)
+    _add_process(joints)
+    joints.add_argument("--bus", metavar="BUS", help=f"drive bus: {_BUS_HELP} (default: hub:drive)")
+    joints.set_defaults(verb=_joints)
+
+    hlc = verbs.add_parser("hlc", help="the high-level controller, one process", description=_hlc.__doc__)
+    _add_process(hlc)
+    hlc.add_argument("--bus", metavar="BUS", help=f"controller bus: {_BUS_HELP} (default: hub:controller)")
+    hlc.add_argument("--endless", action="store_true", help="walk until told to end, not for the scenario's duration")
+    hlc.set_defaults(verb=_hlc)
+
+    gateway = verbs.add_parser("gateway", help="the fault-injecting gateway, one process", description=_gateway.__doc__)
+    _add_process(gateway)
+    gateway.add_argument("--controller-bus", metavar="BUS", help=f"{_BUS_HELP} (default: hub:controller)")
+    gateway.add_argument("--drive-bus", metavar="BUS", help=f"{_BUS_HELP} (default: hub:drive)")
+    gateway.add_argument("--no-faults", action="store_true", help="without the scenario's injectors")
+    gateway.add_argument(
+        "--control", metavar="ADDRESS", default="", help=f"live control at HOST:PORT or a path: {CONTROL_ADDRESS}"
+    )
+    gateway.add_argument(
+        "--control-frames",
+        metavar="SIDE[:COMMAND,STATUS]",
+        help="live control by frames on the controller or drive side, as in drive:0x6C0,0x6C1",
+    )
+    gateway.set_defaults(verb=_gateway)
+
+    fault = verbs.add_parser("fault", help="live control of a running gateway", description=_fault.__doc__)
+    fault.add_argument("word", choices=("list", *NAMED, *UNNAMED), help="what to do")
+    fault.add_argument("name", nargs="?", default="", metavar="INJECTOR", help=f"for {', '.join(NAMED)}")
+    fault.add_argument("--at", default=CONTROL_ADDRESS, metavar="ADDRESS", help="of the gateway (default: %(default)s)")
+    fault.set_defaults(verb=_fault)
+
+    hub = verbs.add_parser("hub", help="an emulated bus for machines without CAN", description=_hub.__doc__)
+    hub.add_argument(
+        "--listen", metavar="HOST:PORT", default="127.0.0.1:29536", help="port 0: a free one (default: %(default)s)"
+    )
+    hub.add_argument("--timed", action="store_true", help="with bit time and arbitration of a real bus")
+    hub.add_argument("--bitrate", type=int, default=1_000_000, metavar="N", help="with --timed (default: %(default)s)")
+    hub.add_argument("--supervisor", type=int, default=0, help=argparse.SUPPRESS)
+    hub.set_defaults(verb=_hub)
+
+
+def add_rig_options(parser: argparse.ArgumentParser) -> None:
+    """Which buses and which processes: of `up`, and of `run --realtime`."""
+    parser.add_argument("--controller-bus", metavar="BUS", help=f"{_BUS_HELP} (default: an own hub)")
+    parser.add_argument("--drive-bus", metavar="BUS", help="as --controller-bus; give both or none")
+    parser.add_argument(
+        "--without",
+        action="append",
+        default=[],
+        choices=PARTS,
+        metavar="PART",
+        help="leave joints, gateway or hlc to foreign software on the same buses; may be repeated",
+    )
+    parser.add_argument("--fifo", action="store_true", help="real-time scheduling (SCHED_FIFO), where permitted")
+
+
+def named_buses(options: argparse.Namespace) -> tuple[str, str] | None:
+    """The two buses, None when none is named; raises BenchError for one without the other, or for one twice."""
+    controller, drive = options.controller_bus, options.drive_bus
+    if controller is None and drive is None:
+        return None
+    if controller is None or drive is None:
+        given, missing = ("--controller-bus", "--drive-bus") if drive is None else ("--drive-bus", "--controller-bus")
+        raise BenchError(f"{given} is given without {missing}: the gateway stands between two buses; give both or none")
+    _check_two(controller, drive)
+    return controller, drive
+
+
+def _check_two(controller: str, drive: str) -> None:
+    if controller == drive:
+        raise BenchError(f"--controller-bus and --drive-bus are both {controller}: frames would go round for ever")
+
+
+def _add_scenario(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "scenario", type=Path, nargs="?", metavar="SCENARIO.yaml", help="rig and faults (default: 500 Hz, no faults)"
+    )
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="overrides", help="as for run")
+
+
+def _add_process(parser: argparse.ArgumentParser) -> None:
+    _add_scenario(parser)
+    parser.add_argument("--epoch", type=int, default=0, metavar="NS", help="CLOCK_MONOTONIC at time 0 of the rig")
+    parser.add_argument("--part", type=Path, metavar="FILE", help="leave this process's part of the result there")
+    parser.add_argument("--fifo", action="store_true", help="real-time scheduling (SCHED_FIFO), where permitted")
+    parser.add_argument("--supervisor", type=int, default=0, help=argparse.SUPPRESS)
+
+
+def _joints(options: argparse.Namespace) -> int:
+    """Six drives on their plant on the drive bus, until SIGTERM or Ctrl-C."""
+    from testbench.process import joints_main
+
+    return _served(lambda scenario, how: joints_main(scenario, _bus(options.bus, "drive"), how), options)
+
+
+def _hlc(options: argparse.Namespace) -> int:
+    """The high-level controller on the controller bus: boots the drives, walks, disables them; exit 1 if it gave up."""
+    from testbench.process import hlc_main
+
+    def serve(scenario: "Scenario", how: "ProcessOptions") -> int:
+        return hlc_main(scenario, _bus(options.bus, "controller"), how, options.endless)
+
+    return _served(serve, options)
+
+
+def _gateway(options: argparse.Namespace) -> int:
+    """The gateway between two buses. The first Ctrl-C ends all faults, frames pass on; the second one ends it."""
+    from testbench.gateway_process import GatewayOptions, control_frames, gateway_main
+
+    def serve(scenario: "Scenario", how: "ProcessOptions") -> int:
+        buses = (_bus(options.controller_bus, "controller"), _bus(options.drive_bus, "drive"))
+        _check_two(*buses)
+        frames = None if options.control_frames is None else control_frames(options.control_frames)
+        return gateway_main(scenario, buses, how, GatewayOptions(not options.no_faults, options.control, frames))
+
+    return _served(serve, options)
+
+
+class _Serve(Protocol):
+    def __call__(self, scenario: "Scenario", how: "ProcessOptions") -> int:
+        """Run one process; returns the exit code."""
+
+
+def _served(serve: _Serve, options: argparse.Namespace) -> int:
+    """Read the scenario, serve, and say what went wrong in one line."""
+    from canopen_exo.errors import CanopenExoError
+    from testbench.process import ProcessOptions
+
+    try:
+        scenario = read_scenario(options)
+        if scenario is None:
+            return USAGE
+        how = ProcessOptions(options.epoch, options.part, options.fifo, options.supervisor)
+        return serve(scenario, how)
+    except (BenchError, CanopenExoError) as error:
+        print(error, file=sys.stderr)
+        return USAGE
+
+
+def read_scenario(options: argparse.Namespace) -> "Scenario | None":
+    """The scenario named, or the default one; None when its file is wrong, which is said."""
+    from fi_gateway.marked_yaml import FileErrors
+    from testbench.scenario import load_scenario, parse_scenario
+
+    try:
+        if options.scenario is not None:
+            return load_scenario(options.scenario, options.overrides)
+        return parse_scenario(DEFAULT_SCENARIO, "default scenario", options.overrides)
+    except FileErrors as error:
+        print(error, file=sys.stderr)
+        return None
+
+
+def _bus(given: str | None, role: str) -> str:
+    """The bus given; else that of python-can's configuration; else the one on the default hub."""
+    if given is not None:
+        return given
+    from canopen_exo.bus.interfaces import configured_bus
+
+    configured = configured_bus(role)
+    return str(configured) if configured is not None else f"hub:{role}"
+
+
+def _hub(options: argparse.Namespace) -> int:
+    """A CAN bus over TCP: everything that connects to the same name is on the same bus. Prints where it listens."""
+    from canopen_exo.bus.hub import hub_main
+    from testbench.process import die_with
+
+    try:
+        if options.supervisor:
+            die_with(options.supervisor)
+    except BenchError as error:
+        print(f"hub: {error}", file=sys.stderr)
+        return USAGE
+    return hub_main(options.listen, options.timed, options.bitrate)
+
+
+def _fault(options: argparse.Namespace) -> int:
+    """List the injectors of a running gateway, or arm, disarm or trigger one.
+
+    start: time 0 is now, for a controller that does not say it on the bus; stop: inject nothing until resume.
+    """
+    from fi_gateway.errors import FaultError
+    from testbench.gateway_process import fault_main
+
+    try:
+        return fault_main(options.word, options.name, options.at)
+    except FaultError as error:
+        print(error, file=sys.stderr)
+        return USAGE
+
+
+def _up(options: argparse.Namespace) -> int:
+    """Start hub, joints, gateway and controller, walk until Ctrl-C, and stop them in order."""
+    from canopen_exo.errors import CanopenExoError
+    from testbench.live import run_up
+    from testbench.supervisor import ProcessError, Setup
+
+    scenario = read_scenario(options)
+    if scenario is None:
+        return USAGE
+    try:
+        setup = Setup(
+            scenario,
+            named_buses(options),
+            frozenset(options.without),
+            faults=not options.no_faults,
+            endless=True,
+            fifo=options.fifo,
+            listen=options.listen,
+            control=options.control,
+        )
+        return run_up(setup)
+    except ProcessError as error:
+        print(error, file=sys.stderr)
+        return INVALID
+    except (BenchError, CanopenExoError) as error:
+        print(error, file=sys.stderr)
+        return USAGE

@@ -1,0 +1,148 @@
+"""The gateway as a process: two interfaces, live control over a socket and, where asked for, over the bus.
+
+The first SIGINT stops injecting and frames pass on until `exo-hil fault resume`; the second one, or SIGTERM, ends it.
+Needs neither MuJoCo nor the controller.
+"""
+
+import logging
+import sys
+from contextlib import closing, nullcontext
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from fi_gateway.bus_control import DEFAULT_COMMAND_ID, DEFAULT_STATUS_ID, BusControl
+from fi_gateway.control import LiveControl, statistics, statistics_text
+from fi_gateway.control_socket import ControlServer
+from fi_gateway.errors import FaultError
+from fi_gateway.gateway import CONTROLLER_PORT, DRIVE_PORT, Gateway
+from testbench.errors import BenchError
+from testbench.process import DONE, ProcessOptions, Session, say, session
+
+if TYPE_CHECKING:
+    from testbench.scenario import Scenario
+
+SIDES: Final = {"controller": CONTROLLER_PORT, "drive": DRIVE_PORT}
+
+
+@dataclass(frozen=True, slots=True)
+class ControlFrames:
+    """Live control over the bus. port: the side of the gateway; COB-IDs of command and status."""
+
+    port: int
+    command_id: int = DEFAULT_COMMAND_ID
+    status_id: int = DEFAULT_STATUS_ID
+
+
+@dataclass(frozen=True, slots=True)
+class GatewayOptions:
+    """faults: with the scenario's injectors; control: address of the control socket, "" for none."""
+
+    faults: bool = True
+    control: str = ""
+    frames: ControlFrames | None = None
+
+
+def gateway_main(
+    scenario: "Scenario", buses: tuple[str, str], options: ProcessOptions, given: GatewayOptions
+) -> int:
+    """The gateway between two buses, until told to end."""
+    from fi_gateway.addition import Additions
+
+    additions = Additions(scenario.injectors if given.faults else {}, scenario.plan, scenario.seed)
+    gateway = Gateway(additions.built(), scenario.plan.cycle_ns)
+    control = LiveControl(gateway, additions)
+    if given.frames is not None:
+        gateway.attach(BusControl(control, given.frames.port, given.frames.command_id, given.frames.status_id))
+    with session("gateway", gateway, list(buses), [0, 1], options) as process:
+        server = ControlServer(control, given.control, lambda: process.loop.latency) if given.control else None
+        with closing(server) if server is not None else nullcontext():
+            if server is not None:
+                server.listen()
+                server.attach(process.loop)
+                say("gateway", f"live control at {server.address}")
+                if server.is_exposed:
+                    say("gateway", f"warning: {server.address} can be reached from other machines")
+            _serve(process, control)
+        gateway.finish(process.loop.now())
+        if options.part is not None:
+            _leave_part(options, process, control)
+        say("gateway", statistics_text(statistics(gateway, process.loop.latency)).replace("\n", "; "))
+    return DONE
+
+
+def control_frames(text: str) -> ControlFrames:
+    """`SIDE` or `SIDE:COMMAND,STATUS`, as in `drive:0x6C0,0x6C1`; raises BenchError."""
+    side, colon, ids = text.partition(":")
+    wrong = f"--control-frames {text!r} given, allowed is controller or drive, or with COB-IDs drive:0x6C0,0x6C1"
+    if side not in SIDES:
+        raise BenchError(wrong)
+    if not colon:
+        return ControlFrames(SIDES[side])
+    try:
+        command_id, status_id = (int(one, 0) for one in ids.split(","))
+    except ValueError as error:
+        raise BenchError(wrong) from error
+    return ControlFrames(SIDES[side], command_id, status_id)
+
+
+def fault_main(word: str, name: str, address: str) -> int:
+    """`exo-hil fault`: one call of a running gateway's live control. Raises FaultError."""
+    from fi_gateway.control import WORDS
+    from fi_gateway.control_socket import ask, ask_listing
+
+    if word in WORDS:
+        ask(address, word, name)
+    else:
+        sys.stdout.write(ask_listing(address).text() + "\n")
+    return DONE
+
+
+def active_faults(address: str) -> list[str]:
+    """Names of the injectors that act now; empty when the gateway does not say."""
+    from fi_gateway.control_socket import ask_listing
+    from fi_gateway.injector import Phase
+
+    try:
+        listing = ask_listing(address, timeout_s=0.1)
+    except FaultError as error:
+        logging.getLogger(__name__).debug("%s", error)
+        return []
+    return [row.name for row in listing.injectors if row.state == Phase.ACTIVE.value]
+
+
+def _serve(process: Session, control: LiveControl) -> None:
+    interrupted = False
+
+    def is_over(now: int) -> bool:
+        nonlocal interrupted
+        orders = process.orders
+        if orders.interrupts and not interrupted:
+            interrupted = True
+            control.pass_through(now, "signal")
+            say("gateway", "injection is stopped, frames pass on; `exo-hil fault resume` resumes, Ctrl-C ends")
+        return orders.terminations > 0 or orders.interrupts > 1
+
+    process.run(is_over)
+
+
+def _leave_part(options: ProcessOptions, process: Session, control: LiveControl) -> None:
+    from testbench.parts import ControlNote, GatewayPart, write_gateway
+
+    assert options.part is not None
+    gateway = control.gateway
+    service = process.service()
+    for port, count in enumerate(gateway.undelivered):
+        if count:
+            service.losses[f"that came in on port {port} not delivered, the other interface was away"] = count
+    part = GatewayPart(
+        service,
+        gateway.time_zero,
+        len(gateway.injectors),
+        list(gateway.frames),
+        list(gateway.lost),
+        process.loop.latency,
+        gateway.records,
+        [ControlNote(row.time_ns, row.what, row.name, row.source, row.refused) for row in control.rows],
+        process.loop.trace or [],
+    )
+    write_gateway(options.part, part)

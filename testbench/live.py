@@ -1,0 +1,41 @@
+"""`exo-hil up`: a rig that walks until it is told to stop, with a status line where there is a terminal."""
+
+import sys
+from typing import Final
+
+from testbench.gateway_process import active_faults
+from testbench.status import StatusLine
+from testbench.supervisor import Setup, Supervisor
+
+PASS: Final = 0
+
+
+def run_up(setup: Setup) -> int:
+    """Start the rig and keep it until Ctrl-C or SIGTERM, which is its normal end (0). Raises BenchError."""
+    line: StatusLine | None = None
+
+    def say(text: str) -> None:
+        if line is not None:
+            line.clear()
+        print(text, file=sys.stderr, flush=True)
+
+    def show(now: int) -> None:
+        if line is not None:
+            line.show(now)
+
+    try:
+        with Supervisor(setup, say, show) as rig:
+            rig.start()
+            for what, bus in zip(("controller bus", "drive bus"), rig.buses, strict=True):
+                say(f"{what}: {bus}")
+            if "hlc" in setup.without:
+                say(f"ready for a controller on {rig.buses[0]}")
+            say(f"live control: exo-hil fault list --at {rig.control_address}")
+            say("running; Ctrl-C stops")
+            line = StatusLine(rig.watch, sys.stderr, lambda: active_faults(rig.control_address))
+            rig.run(lambda now: False)
+    except KeyboardInterrupt:
+        if line is not None:
+            line.clear()
+        print("stopped", file=sys.stderr)
+    return PASS

@@ -1,0 +1,175 @@
+"""A rig against the clock: the processes of `exo-hil up` on an own hub or on named interfaces, the test beside them.
+
+Frames are those the supervisor hears. Time goes on while the test computes; what came meanwhile is read with the next
+call, and what the interface had no more room for is counted and said in the failure report. `run_for` may end up to
+50 ms late on a silent bus.
+A frame of `send` goes out on a connection of its own, as from one more node.
+"""
+
+import contextlib
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Final, final
+
+from canopen_exo.bus.channel import Channel
+from canopen_exo.bus.frame import Frame
+from canopen_exo.bus.medium import Transmission
+from canopen_exo.bus.node import MS, SECOND
+from fi_gateway.control import InjectorRow
+from fi_gateway.control_socket import ask, ask_listing, ask_to_add
+from fi_gateway.errors import FaultError
+from testbench.errors import BenchError
+from testbench.merge import merge
+from testbench.plugin.exo import Exo
+from testbench.plugin.golden import Goldens
+from testbench.plugin.injection import NOT_RUN, GatewayControl, Part
+from testbench.process import open_bus
+from testbench.record import Truth
+from testbench.scenario import Scenario
+from testbench.supervisor import Setup, Supervisor
+
+_SENDING_NS: Final = SECOND
+"""Most that a frame of the test may wait for its interface."""
+
+
+@final
+class RealTimeGateway(GatewayControl):
+    """The gateway process of a real-time rig, by its live control."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        super().__init__(scenario)
+        self._address: str = ""
+
+    def connect(self, rig: Supervisor) -> None:
+        """The rig runs: from now on calls reach its gateway."""
+        self._address = rig.control_address
+
+    def listing(self) -> list[InjectorRow]:
+        """As they are now; empty before the rig runs."""
+        return ask_listing(self._address).injectors if self._address else []
+
+    def command(self, word: str, name: str) -> None:
+        """A word of live control. Raises FaultError."""
+        if not self._address:
+            raise FaultError(NOT_RUN.format(what=f"{word} {name}".strip()))
+        ask(self._address, word, name)
+
+    def _add(self, name: str, given: Part, at_once: bool) -> None:
+        before = self.additions.specs
+        self.additions.read(name, given)
+        if self._address:
+            try:
+                ask_to_add(self._address, name, given, at_once)
+            except FaultError:
+                self.additions.specs = before
+                raise
+
+
+@final
+class RealTimeExo(Exo):
+    """A rig of processes. buses: of controller and drives, None for an own hub; without: parts that are foreign."""
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        bus: str,
+        buses: tuple[str, str] | None,
+        without: frozenset[str],
+        goldens: Goldens,
+    ) -> None:
+        self._injectors: Final = RealTimeGateway(scenario)
+        super().__init__(scenario, bus, self._injectors, goldens)
+        self._setup: Final[Setup] = Setup(scenario, buses, without, record=True)
+        self._stack: Final = contextlib.ExitStack()
+        self._rig: Supervisor | None = None
+        self._rows: list[Transmission] = []
+        self._heard: int = 0
+        self._senders: Final[dict[int, Channel]] = {}
+
+    @property
+    def time_ns(self) -> int:
+        """Since the rig was started; 0 before."""
+        return 0 if self._rig is None else self._rig.now()
+
+    @property
+    def rows(self) -> list[Transmission]:
+        """What the supervisor heard."""
+        return self._rows
+
+    @property
+    def timing(self) -> str:
+        """Late cycles and frames that were not heard."""
+        rig = self._rig
+        if rig is None:
+            return ""
+        watch = rig.watch
+        return (
+            f"timing: {watch.late} of {watch.cycles} cycles late, SYNC off by at most {watch.worst_ns / 1e6:.1f} ms; "
+            f"{rig.missed} frames not heard"
+        )
+
+    def close(self) -> None:
+        """Stop all processes in order."""
+        for channel in self._senders.values():
+            channel.close()
+        self._senders.clear()
+        self._stack.close()
+
+    def _start(self) -> None:
+        if self._rig is None:
+            scenario = replace(self.scenario, injectors=self._injectors.additions.specs)
+            rig = Supervisor(replace(self._setup, scenario=scenario))
+            self._stack.enter_context(rig)
+            try:
+                rig.start()
+            finally:
+                self._rows = rig.rows  # a start that failed is reported with what was heard
+            self._rig = rig
+            if "gateway" not in self._setup.without:
+                self._injectors.connect(rig)
+            self._listen()
+
+    def _started(self) -> Supervisor:
+        self._start()
+        assert self._rig is not None
+        return self._rig
+
+    def _advance(self, limit_ns: int, is_over: Callable[[], bool] | None, every_frame: bool = False) -> bool:
+        found = False
+
+        def over(now: int) -> bool:
+            nonlocal found
+            self._listen()
+            found = is_over is not None and is_over()
+            return found or now >= limit_ns
+
+        self._started().run(over)
+        return found
+
+    def _listen(self) -> None:
+        rows, observer = self._rows, self.observer
+        while self._heard < len(rows):
+            observer.hear(rows[self._heard])
+            self._heard += 1
+
+    def _send(self, bus: int, frame: Frame) -> None:
+        rig = self._started()
+        channel = self._senders.get(bus)
+        if channel is None:
+            channel = self._senders[bus] = open_bus(rig.buses[bus])
+        channel.receive()  # nobody else reads from it
+        lost = channel.lost
+        limit = rig.now() + _SENDING_NS
+        if not channel.send(frame):
+            rig.run(lambda now: channel.send(frame) or now >= limit)
+        if channel.lost != lost or rig.now() >= limit:
+            raise BenchError(f"send: {channel.name} does not take frame {frame}; is it up and connected?")
+
+    def _truth(self) -> tuple[Truth, float]:
+        """What the drives' frames say, up to the last whole cycle."""
+        rows = self._rows
+        latest_ns = rows[-1].end_ns - self.plan.cycle_ns - self.observer.time_zero_ns
+        elapsed_ns = min(latest_ns, self.scenario.motion.duration_ns) // MS * MS
+        if elapsed_ns <= 0:
+            raise BenchError("deviation: the motion has only begun; let it run for two cycles at least")
+        return merge(self.plan, elapsed_ns, None, None, None, rows).truth, elapsed_ns / 1e9

@@ -1,0 +1,278 @@
+"""One process of a rig against the clock: the joints, or the high-level controller; and what all of them share.
+
+Each serves one Node on its interfaces until it is told to end, and then leaves its part of the result. All processes
+of a rig share one epoch on CLOCK_MONOTONIC, so that the grids of SYNC and of physics agree as in lock-step.
+SIGTERM and SIGINT end a process in order. A supervised process ends by itself when its supervisor is gone.
+The gateway (testbench.gateway_process) needs neither MuJoCo nor the controller: everything heavy is imported by the
+process that needs it.
+"""
+
+import ctypes
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Final, final
+
+from canopen_exo.bus.channel import Channel
+from canopen_exo.bus.interfaces import open_channel, parse_bus
+from canopen_exo.bus.node import MS, NEVER, SECOND, Node
+from canopen_exo.bus.realtime import RealTimeLoop, request_fifo
+from canopen_exo.errors import CanopenExoError
+from testbench.errors import BenchError
+
+if TYPE_CHECKING:  # numpy, and with it everything heavy
+    from hlc.node import HighLevelController
+    from joint_emulators.rack import Rack
+    from testbench.parts import Service
+    from testbench.scenario import Scenario
+
+DONE: Final = 0
+ENDED_EARLY: Final = 1
+"""The controller gave the motion up; its part says why."""
+
+LEAVE_NS: Final = SECOND
+"""Most that the controller may take to disable the drives once told to end."""
+
+_LOOK_NS: Final = 50 * MS
+"""How often a supervised process looks whether its supervisor is there."""
+
+_PR_SET_PDEATHSIG: Final = 1  # prctl(2)
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessOptions:
+    """How a process runs. epoch_ns: time 0 of the rig on CLOCK_MONOTONIC, 0 for now; part: where to leave its part.
+
+    fifo: ask for real-time scheduling; supervisor: its process id, 0 for none.
+    """
+
+    epoch_ns: int = 0
+    part: Path | None = None
+    fifo: bool = False
+    supervisor: int = 0
+
+
+@final
+class Orders:
+    """What signals have asked for so far."""
+
+    def __init__(self) -> None:
+        self.interrupts: int = 0
+        self.terminations: int = 0
+
+    @property
+    def count(self) -> int:
+        """Of both kinds."""
+        return self.interrupts + self.terminations
+
+    def note(self, number: int, _frame: FrameType | None) -> None:
+        """A signal handler."""
+        if number == signal.SIGINT:
+            self.interrupts += 1
+        else:
+            self.terminations += 1
+
+    @contextmanager
+    def taken(self) -> Iterator["Orders"]:
+        """SIGINT and SIGTERM are noted here; the handlers before are put back at the end."""
+        before = [(number, signal.signal(number, self.note)) for number in (signal.SIGINT, signal.SIGTERM)]
+        try:
+            yield self
+        finally:
+            for number, handler in before:
+                signal.signal(number, handler)
+
+
+@final
+class Session:
+    """A node on its interfaces. start_ns: loop time from which it is served."""
+
+    def __init__(
+        self, name: str, node: Node, channels: list[Channel], ports: list[int], options: ProcessOptions, orders: Orders
+    ) -> None:
+        self.name: Final[str] = name
+        self.orders: Final[Orders] = orders
+        self.loop: Final[RealTimeLoop] = RealTimeLoop(
+            node,
+            channels,
+            ports,
+            options.epoch_ns or time.monotonic_ns(),
+            record=options.part is not None,
+            measure_latency=name == "gateway",
+        )
+        self.start_ns: Final[int] = (self.loop.now() // MS + 1) * MS
+        self._channels: Final[list[Channel]] = channels
+        self._supervisor: Final[int] = options.supervisor
+        self._look_at: int = 0
+
+    def run(self, until: Callable[[int], bool]) -> None:
+        """Serve until `until(now)`, or until the supervisor is gone."""
+
+        def over(now: int) -> bool:
+            if self._supervisor and now >= self._look_at:
+                self._look_at = now + _LOOK_NS
+                if os.getppid() != self._supervisor:
+                    return True
+            return until(now)
+
+        self.loop.run(over)
+
+    def service(self) -> "Service":
+        """How it was served, for its part."""
+        from testbench.parts import Service
+
+        losses = {
+            f"dropped at port {port}, its transmit queue was full": count
+            for port, count in enumerate(self.loop.dropped)
+            if count
+        }
+        for channel in self._channels:
+            if channel.overruns:
+                losses[f"dropped by {channel.name} before they were read"] = channel.overruns
+            if channel.lost:
+                losses[f"not taken by {channel.name}"] = channel.lost
+        return Service(self.start_ns, self.loop.now(), self.loop.lateness, losses)
+
+
+@contextmanager
+def session(
+    name: str, node: Node, buses: list[str], ports: list[int], options: ProcessOptions
+) -> Iterator[Session]:
+    """A node with its interfaces open. Raises BenchError when one cannot be opened; says what it could not get."""
+    if options.supervisor:
+        die_with(options.supervisor)
+    if options.fifo:
+        refusal = request_fifo()
+        if refusal is not None:
+            say(name, refusal)
+    orders = Orders()
+    channels: list[Channel] = []
+    with orders.taken():
+        try:
+            for bus in buses:
+                channels.append(open_bus(bus))
+            yield Session(name, node, channels, ports, options, orders)
+        finally:
+            for channel in channels:
+                channel.close()
+
+
+def joints_main(scenario: "Scenario", bus: str, options: ProcessOptions) -> int:
+    """Six drives on their plant, until told to end."""
+    from testbench.rig import build_mechanics, build_rack
+    from testbench.run import rig_params
+
+    params = rig_params(scenario)
+    rack = build_rack(params, build_mechanics(params))
+    with session("joints", rack, [bus], [0] * len(rack.devices), options) as process:
+        rack.step_at = rack.wake_at = process.start_ns
+
+        def over(now: int) -> bool:
+            if options.part is None:
+                rack.truth.clear()
+            return process.orders.count > 0
+
+        process.run(over)
+        if options.part is not None:
+            _leave_joints(options.part, process, rack)
+    return DONE
+
+
+def hlc_main(scenario: "Scenario", bus: str, options: ProcessOptions, endless: bool) -> int:
+    """The high-level controller: one motion, or with `endless` until told to end. 1 when it gave up."""
+    from hlc.node import Phase
+    from testbench.rig import build_master, build_mechanics
+    from testbench.run import motion_over, rig_params
+
+    params = rig_params(scenario)
+    master, controller = build_master(params, build_mechanics(params), NEVER if endless else -1)
+    duration_ns = 0 if endless else params.duration_ns
+    with session("hlc", master, [bus], [0], options) as process:
+        master.wake_at = master.supervise_at = process.start_ns
+        give_up_at = NEVER
+
+        def over(now: int) -> bool:
+            nonlocal give_up_at
+            if options.part is None:
+                controller.samples.clear()
+            phase = controller.phase
+            if process.orders.count == 0:
+                return motion_over(controller, duration_ns, now)
+            controller.leave = True
+            give_up_at = min(give_up_at, now + LEAVE_NS)
+            is_left = phase in (Phase.WAITING, Phase.STOPPED, Phase.FAILED)
+            return is_left or now >= give_up_at or process.orders.count > 1
+
+        process.run(over)
+        if options.part is not None:
+            _leave_hlc(options.part, process, controller)
+        asked = process.orders.count > 0
+    for event in controller.events:
+        say("hlc", f"{event.joint or 'rig'}: {event.text}")
+    return DONE if controller.completed or asked else ENDED_EARLY
+
+
+def _leave_joints(path: Path, process: Session, rack: "Rack") -> None:
+    import numpy as np
+
+    from testbench.parts import JointsPart, write_joints
+
+    count = len(rack.devices)
+    q, dq, tau = (
+        np.array([getattr(row, name) for row in rack.truth], np.float64).reshape(-1, count)
+        for name in ("q", "dq", "tau")
+    )
+    times = np.array([row.time_ns for row in rack.truth], np.int64)
+    write_joints(path, JointsPart(process.service(), times, q, dq, tau, process.loop.trace or []))
+
+
+def _leave_hlc(path: Path, process: Session, controller: "HighLevelController") -> None:
+    import numpy as np
+
+    from testbench.parts import HlcPart, NotedEvent, write_hlc
+
+    count, samples = len(controller.plan.joints), controller.samples
+    q_d, dq_d, tau = (
+        np.array([getattr(sample, name) for sample in samples], np.float64).reshape(-1, count)
+        for name in ("q_d", "dq_d", "tau_command")
+    )
+    part = HlcPart(
+        process.service(),
+        controller.time_zero,
+        controller.completed,
+        list(controller.late),
+        [NotedEvent(event.time_ns, event.joint, event.kind, event.text) for event in controller.events],
+        np.array([sample.cycle for sample in samples], np.int64),
+        q_d,
+        dq_d,
+        tau,
+        process.loop.trace or [],
+    )
+    write_hlc(path, part)
+
+
+def open_bus(bus: str) -> Channel:
+    """The interface of that name; raises BenchError with one line that says what is missing."""
+    try:
+        return open_channel(parse_bus(bus))
+    except CanopenExoError as error:
+        raise BenchError(str(error)) from error
+
+
+def die_with(supervisor: int) -> None:
+    """Have SIGTERM sent to this process when its supervisor ends (Linux); elsewhere it only looks for it regularly."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
+    if os.getppid() != supervisor:
+        raise BenchError(f"the supervisor (process {supervisor}) is gone; start this process by itself or with `up`")
+
+
+def say(name: str, text: str) -> None:
+    """One line of talk, to stderr."""
+    print(f"{name}: {text}", file=sys.stderr, flush=True)

@@ -1,0 +1,68 @@
+"""The live status line of a running rig: one line, rewritten in place, on a terminal only."""
+
+from collections.abc import Callable
+from typing import Final, TextIO, final
+
+from canopen_exo.bus.node import MS, NEVER, ErrorState
+from canopen_exo.plan import STATUS_MOTION, STATUS_STARTING, STATUS_STOPPED
+from testbench.watch import Watch, states_text
+
+EVERY_NS: Final = 250 * MS
+
+_MOTION: Final = {0: "starting", STATUS_STARTING: "fading in", STATUS_MOTION: "walking", STATUS_STOPPED: "stopped"}
+
+
+@final
+class StatusLine:
+    """Shows a Watch. faults: names of the active injectors, asked for at every line; nothing when no terminal."""
+
+    def __init__(self, watch: Watch, stream: TextIO, faults: Callable[[], list[str]]) -> None:
+        self._watch: Final[Watch] = watch
+        self._stream: Final[TextIO] = stream
+        self._faults: Final[Callable[[], list[str]]] = faults
+        self._is_on: Final[bool] = stream.isatty()
+        self._next_ns: int = -NEVER
+        self._shown_ns: int = 0
+        self._bits: list[int] = [0, 0]
+
+    def show(self, now: int) -> None:
+        """Rewrite the line when it is time."""
+        if not self._is_on or now < self._next_ns:
+            return
+        self._stream.write(f"\r\x1b[K{self.text(now)}")
+        self._stream.flush()
+        self._next_ns = now + EVERY_NS
+
+    def clear(self) -> None:
+        """Make room for another line."""
+        if self._is_on:
+            self._stream.write("\r\x1b[K")
+            self._stream.flush()
+            self._next_ns = -NEVER
+
+    def text(self, now: int) -> str:
+        """The line; loads are those since the last one."""
+        watch = self._watch
+        elapsed = max(now - self._shown_ns, 1)
+        loads = [
+            100 * (bits - before) * 1e9 / watch.plan.bitrate / elapsed
+            for bits, before in zip(watch.bits, self._bits, strict=True)
+        ]
+        self._bits, self._shown_ns = list(watch.bits), now
+        parts = [
+            f"{_MOTION.get(watch.motion, 'unknown')} {_since(watch, now)}",
+            f"load {loads[0]:.0f} %, {loads[1]:.0f} %",
+            f"late {watch.late} of {watch.cycles} cycles, SYNC off by at most {watch.worst_ns / 1e6:.1f} ms",
+            f"drives: {states_text(watch.states.values())}",
+        ]
+        for name, state in zip(("controller bus", "drive bus"), watch.ports, strict=True):
+            if state is not ErrorState.ERROR_ACTIVE:
+                parts.append(f"{name} {state.value.replace('_', ' ')}")
+        faults = self._faults()
+        if faults:
+            parts.append(f"faults: {', '.join(faults)}")
+        return " | ".join(parts)
+
+
+def _since(watch: Watch, now: int) -> str:
+    return f"{(now - watch.time_zero) / 1e9:.1f} s" if watch.time_zero != NEVER else ""

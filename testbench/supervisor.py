@@ -1,0 +1,431 @@
+"""All processes of a rig: started in order, watched, and stopped in order.
+
+Hub (when no interface is named), joints, gateway, high-level controller. Each is ready when it is heard on CAN
+(testbench.watch); the hub, which is no CAN node, when it prints the address it listens on. One that ends unasked ends
+the rig: the others get the time their configured time-outs need to react by themselves, then all are stopped.
+Every process is a session of its own, so that Ctrl-C reaches the supervisor alone; on Linux the kernel ends them when
+the supervisor is killed, elsewhere they look for it themselves (the hub does not).
+Left out: starting a part again; a drive that came back would have to be configured and enabled anew.
+"""
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Final, final
+
+from canopen_exo.bus.channel import Channel
+from canopen_exo.bus.medium import Transmission
+from canopen_exo.bus.node import MS, SECOND
+from canopen_exo.bus.realtime import RealTimeLoop
+from testbench.errors import BenchError
+from testbench.process import DONE, ENDED_EARLY, Orders, open_bus
+from testbench.scenario import Scenario
+from testbench.watch import CONTROLLER_PORT, DRIVE_PORT, Watch
+
+PARTS: Final = ("joints", "gateway", "hlc")
+"""In the order in which they are started; any of them may be foreign software instead."""
+
+READY_NS: Final = 30 * SECOND
+"""Most that a process may take to be heard: it imports MuJoCo on a machine that may be busy."""
+
+REACT_NS: Final = SECOND
+"""How long the others are left alone when one has died: longer than any time-out of drives and controller."""
+
+END_NS: Final = 10 * SECOND
+"""Most that a process may take to end in order, its part of the result included."""
+
+_LOOK_NS: Final = 20 * MS
+_LAST_LINES: Final = 12
+
+
+class ProcessError(BenchError):
+    """A process did not become ready, or ended unasked; the message has its last lines."""
+
+
+@dataclass(frozen=True, slots=True)
+class Setup:
+    """What to start. buses: names of controller and drive bus, None for an own hub; without: PARTS that are foreign.
+
+    faults: with the scenario's injectors; endless: walk until stopped; keep_parts: have each process leave its part;
+    record: keep `rows`; listen: HOST:PORT of an own hub, port 0 for a free one; control: address of the gateway's live
+    control, "" for a Unix socket in the rig's folder (where there are such sockets).
+    """
+
+    scenario: Scenario
+    buses: tuple[str, str] | None = None
+    without: frozenset[str] = frozenset()
+    faults: bool = True
+    endless: bool = False
+    keep_parts: bool = False
+    record: bool = False
+    fifo: bool = False
+    listen: str = "127.0.0.1:0"
+    control: str = ""
+
+
+@final
+class Process:
+    """A running process. name: hub or one of PARTS; lines: the last ones it printed. Its output is read by `listen`."""
+
+    def __init__(self, name: str, arguments: list[str], say: Callable[[str], None]) -> None:
+        self.name: Final[str] = name
+        self.lines: Final[deque[str]] = deque(maxlen=_LAST_LINES)
+        self.is_told: bool = False
+        self._say: Final[Callable[[str], None]] = say
+        self._rest: bytes = b""
+        self._is_closed: bool = False
+        self._running: Final[subprocess.Popen[bytes]] = subprocess.Popen(
+            [sys.executable, "-P", "-m", "testbench.cli", *arguments],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+        )
+        os.set_blocking(self.fileno(), False)
+
+    @property
+    def pid(self) -> int:
+        """Its process id."""
+        return self._running.pid
+
+    def wait(self, timeout_s: float) -> None:
+        """Until it ends, at most that long."""
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._running.wait(timeout_s)
+
+    @property
+    def code(self) -> int | None:
+        """Exit code, -N when signal N killed it; None while it runs."""
+        return self._running.poll()
+
+    def fileno(self) -> int:
+        """Of its output."""
+        assert self._running.stdout is not None
+        return self._running.stdout.fileno()
+
+    def listen(self) -> bool:
+        """Take what it has printed; False when there will be no more."""
+        while not self._is_closed:
+            try:
+                data = os.read(self.fileno(), 1 << 14)
+            except BlockingIOError:
+                return True
+            *lines, self._rest = (self._rest + data).split(b"\n")
+            if not data and self._rest:
+                lines.append(self._rest)
+                self._rest = b""
+            for line in lines:
+                text = line.decode(errors="replace").rstrip()
+                self.lines.append(text)
+                self._say(text)
+            if not data:
+                return False
+        return False
+
+    def tell(self, number: int) -> None:
+        """Send it a signal; from now on its end is expected."""
+        self.is_told = True
+        with contextlib.suppress(ProcessLookupError):
+            self._running.send_signal(number)
+
+    def close(self) -> None:
+        """Kill what is left of it."""
+        if self.code is None:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(self.pid, signal.SIGKILL)
+        self._running.wait()
+        self.listen()
+        self._is_closed = True
+        assert self._running.stdout is not None
+        self._running.stdout.close()
+
+    def obituary(self) -> str:
+        """How it ended, and what it said last."""
+        code = self.code
+        if not self._is_closed:
+            self.listen()
+        if code is None:
+            how = "is running"
+        elif code < 0:
+            how = f"was killed by {signal.Signals(-code).name}"
+        else:
+            how = f"ended with exit code {code}"
+        said = "".join(f"\n  {line}" for line in self.lines)
+        return f"{self.name} {how}{'; its last lines:' + said if said else ''}"
+
+
+@final
+class Supervisor:
+    """A rig of processes; a context manager that leaves none behind.
+
+    watch: the listener on both buses; processes: by name; folder: of this rig alone, removed at the end.
+    say: told each line that a process prints; tick: called with the loop's time at least every 50 ms.
+    """
+
+    def __init__(
+        self,
+        setup: Setup,
+        say: Callable[[str], None] = lambda line: None,
+        tick: Callable[[int], None] = lambda now: None,
+    ) -> None:
+        self.setup: Final[Setup] = setup
+        self.watch: Final[Watch] = Watch(setup.scenario.plan)
+        self.processes: Final[dict[str, Process]] = {}
+        self.orders: Final[Orders] = Orders()
+        self._say: Final[Callable[[str], None]] = say
+        self._tick: Final[Callable[[int], None]] = tick
+        self._temporary: Final = tempfile.TemporaryDirectory(prefix="exo-hil-")
+        self._epoch_ns: Final[int] = time.monotonic_ns()
+        self._cleaning: Final = contextlib.ExitStack()
+        self._channels: Final[list[Channel]] = []
+        self._loop: RealTimeLoop | None = None
+        self._hub_address: str = ""
+        self._look_at: int = 0
+        self._is_started: bool = False
+
+    def __enter__(self) -> "Supervisor":
+        self._cleaning.enter_context(self._temporary)
+        self._cleaning.enter_context(self.orders.taken())
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            self.stop()
+        finally:
+            for process in reversed(self.processes.values()):
+                process.close()
+            self._close_channels()
+            self._cleaning.close()
+
+    # --- what a run does -----------------------------------------------------------------------------------------
+
+    def start(self, parts: Sequence[str] = PARTS) -> None:
+        """Start hub and parts, in order; those that are foreign are waited for all the same, except the controller.
+
+        Raises ProcessError, BenchError for a bus that cannot be opened, KeyboardInterrupt when asked to end meanwhile.
+        """
+        setup = self.setup
+        self._scenario_file.write_text(setup.scenario.resolved_yaml(), encoding="utf-8")
+        if setup.buses is None:
+            self._start_hub()
+        for bus in self.buses:
+            self._channels.append(open_bus(bus))
+        record = setup.record or (setup.keep_parts and "gateway" in setup.without)
+        self._loop = RealTimeLoop(self.watch, self._channels, [0, 1], self._epoch_ns, record=record)
+        starts = {"joints": self._start_joints, "gateway": self._start_gateway, "hlc": self._start_hlc}
+        for name in PARTS:
+            if name in parts:
+                starts[name]()
+        self._is_started = True
+
+    def run(self, until: Callable[[int], bool]) -> None:
+        """Listen until `until(now)`. Raises ProcessError when a process ends unasked, KeyboardInterrupt."""
+        dead = self._listen(until)
+        if dead is not None:
+            self._mourn(dead)
+
+    def stop(self) -> None:
+        """End all that runs in order: controller, gateway, joints, hub. A second interrupt kills."""
+        before = self.orders.count
+        for name in ("hlc", "gateway", "joints", "hub"):
+            process = self.processes.get(name)
+            if process is None or process.code is not None:
+                continue
+            if name == "hub":
+                self._close_channels()
+            process.tell(signal.SIGTERM)
+            limit = self.now() + END_NS
+            while process.code is None and self.now() < limit and self.orders.count <= before:
+                self._idle(process)
+            if process.code is None:
+                process.close()
+
+    # --- what it knows -------------------------------------------------------------------------------------------
+
+    @property
+    def buses(self) -> tuple[str, str]:
+        """Names of controller and drive bus."""
+        if self.setup.buses is not None:
+            return self.setup.buses
+        return f"hub:{self._hub_address}/controller", f"hub:{self._hub_address}/drive"
+
+    @property
+    def control_address(self) -> str:
+        """Of the gateway's live control; "" when there is none."""
+        if self.setup.control or os.name != "posix":
+            return self.setup.control
+        return str(Path(self._temporary.name) / "control")
+
+    @property
+    def rows(self) -> list[Transmission]:
+        """What was heard on both buses, kept when asked for, and when parts are kept and the gateway is foreign."""
+        return [] if self._loop is None or self._loop.trace is None else self._loop.trace
+
+    @property
+    def missed(self) -> int:
+        """Frames that the supervisor itself did not hear, because it was not read from in time."""
+        return 0 if self._loop is None else self._loop.losses()
+
+    def now(self) -> int:
+        """The rig's clock, ns."""
+        return time.monotonic_ns() - self._epoch_ns
+
+    def part(self, name: str) -> Path:
+        """Where a process leaves its part."""
+        return Path(self._temporary.name) / f"{name}.npz"
+
+    # --- inside --------------------------------------------------------------------------------------------------
+
+    def _start_joints(self) -> None:
+        if "joints" in self.setup.without:
+            self.watch.ask(self.now(), DRIVE_PORT)
+        else:
+            self._spawn("joints", ["--bus", self.buses[1], *self._common("joints")])
+        self._await("joints", lambda: not self.watch.missing(DRIVE_PORT), self._missing_drives)
+
+    def _start_gateway(self) -> None:
+        if "gateway" not in self.setup.without:
+            controller_bus, drive_bus = self.buses
+            arguments = ["--controller-bus", controller_bus, "--drive-bus", drive_bus, *self._common("gateway")]
+            if self.control_address:
+                arguments += ["--control", self.control_address]
+            self._spawn("gateway", [*arguments, *([] if self.setup.faults else ["--no-faults"])])
+        self.watch.ask(self.now(), CONTROLLER_PORT)
+        self._await("gateway", lambda: not self.watch.missing(CONTROLLER_PORT), self._missing_answers)
+
+    def _start_hlc(self) -> None:
+        if "hlc" not in self.setup.without:
+            arguments = ["--bus", self.buses[0], *self._common("hlc")]
+            self._spawn("hlc", [*arguments, *(["--endless"] if self.setup.endless else [])])
+            self._await("hlc", lambda: self.watch.master_heard, lambda: "nothing of it was heard on the controller bus")
+
+    @property
+    def _scenario_file(self) -> Path:
+        return Path(self._temporary.name) / "scenario.yaml"
+
+    def _common(self, name: str) -> list[str]:
+        arguments = [str(self._scenario_file), "--epoch", str(self._epoch_ns), "--supervisor", str(os.getpid())]
+        if self.setup.keep_parts:
+            arguments += ["--part", str(self.part(name))]
+        return arguments + (["--fifo"] if self.setup.fifo else [])
+
+    def _spawn(self, name: str, arguments: list[str]) -> Process:
+        self._check_orders()
+        process = Process(name, [name, *arguments], self._say)
+        self.processes[name] = process
+        if self._loop is not None:
+            self._loop.add_reader(process, lambda now: self._hear(process))
+        return process
+
+    def _hear(self, process: Process) -> None:
+        if not process.listen() and self._loop is not None:
+            self._loop.remove_reader(process)
+
+    def _start_hub(self) -> None:
+        bitrate = str(self.setup.scenario.plan.bitrate)
+        arguments = ["--timed", "--listen", self.setup.listen, "--bitrate", bitrate, "--supervisor", str(os.getpid())]
+        hub = self._spawn("hub", arguments)
+        said = "listening on "
+        limit = self.now() + READY_NS
+        while not self._hub_address:
+            self._check_orders()
+            self._idle(hub)
+            for line in hub.lines:
+                if line.startswith(said):
+                    self._hub_address = line.removeprefix(said)
+            if not self._hub_address and (hub.code is not None or self.now() >= limit):
+                raise ProcessError(f"the hub does not listen: {hub.obituary()}")
+
+    def _await(self, name: str, is_ready: Callable[[], bool], missing: Callable[[], str]) -> None:
+        """Listen until that part of the rig is heard."""
+        limit = self.now() + READY_NS
+        self.run(lambda now: is_ready() or now >= limit)
+        if not is_ready():
+            said = f"; {self.processes[name].obituary()}" if name in self.processes else ""
+            raise ProcessError(f"{name}: not ready after {READY_NS / 1e9:g} s: {missing()}{said}")
+
+    def _missing_drives(self) -> str:
+        missing = ", ".join(self.watch.missing(DRIVE_PORT))
+        return f"no boot-up and no SDO answer on the drive bus {self.buses[1]} from {missing}"
+
+    def _missing_answers(self) -> str:
+        missing = ", ".join(self.watch.missing(CONTROLLER_PORT))
+        return f"no SDO answer came through to the controller bus {self.buses[0]} from {missing}"
+
+    def _listen(self, until: Callable[[int], bool]) -> Process | None:
+        """Run the loop; returns a process that ended unasked."""
+        loop = self._loop
+        assert loop is not None
+        dead: Process | None = None
+
+        def over(now: int) -> bool:
+            nonlocal dead
+            if now >= self._look_at:
+                self._look_at = now + _LOOK_NS
+                self._tick(now)
+                for process in self.processes.values():
+                    if self._is_dead(process):
+                        dead = process
+                        return True
+                if self.orders.count:
+                    return True
+            return until(now)
+
+        loop.run(over)
+        if dead is None:
+            self._check_orders()
+        return dead
+
+    def _is_dead(self, process: Process) -> bool:
+        """Whether it ended unasked; the controller may when its one motion is over."""
+        code = process.code
+        if code is None or process.is_told:
+            return False
+        may_end = process.name == "hlc" and self._is_started and not self.setup.endless
+        return not may_end or code not in (DONE, ENDED_EARLY)
+
+    def _check_orders(self) -> None:
+        """Raise KeyboardInterrupt when a signal asked to end."""
+        if self.orders.count:
+            raise KeyboardInterrupt
+
+    def _mourn(self, dead: Process) -> None:
+        """Let the others react, then raise what is known about the dead."""
+        dead.is_told = True
+        alarms = len(self.watch.alarms)
+        died_at = self.now()
+        others = [process for process in self.processes.values() if process is not dead]
+        for process in others:
+            process.is_told = True
+        self._listen(lambda now: now >= died_at + REACT_NS or all(process.code is not None for process in others))
+        text = dead.obituary()
+        if len(self.watch.alarms) > alarms:
+            told = {f"{alarm.joint} {alarm.code:04X}" for alarm in self.watch.alarms[alarms:] if alarm.code}
+            text += f"\nthe drives then reported: {', '.join(sorted(told))}"
+        raise ProcessError(text)
+
+    def _idle(self, process: Process) -> None:
+        """One short turn of waiting for a process: everything that is open is served meanwhile."""
+        loop = self._loop
+        if loop is not None and self._channels:
+            limit = loop.now() + _LOOK_NS
+            loop.run(lambda now: now >= limit or process.code is not None)
+        else:
+            process.listen()
+            process.wait(_LOOK_NS / SECOND)
+
+    def _close_channels(self) -> None:
+        for channel in self._channels:
+            channel.close()
+        self._channels.clear()

@@ -1,0 +1,541 @@
+"""The real-time loop, on a clock and on channels that the test moves: nothing here sleeps."""
+
+import gc
+import socket
+from collections.abc import Callable
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from canopen_exo.bus.channel import Arrival, Channel
+from canopen_exo.bus.frame import Frame
+from canopen_exo.bus.medium import QUEUE_LENGTH
+from canopen_exo.bus.node import MS, NEVER, ErrorState, Node, Out, PortState
+from canopen_exo.bus.realtime import RECEIVED, RealTimeLoop
+from canopen_exo.errors import CanopenExoError
+
+EPOCH = 7_000_000_000
+
+
+class FakeChannel(Channel):
+    """fd: fake descriptor. takes: how many frames it accepts before it blocks. reads: times of `receive`."""
+
+    def __init__(self, world: "World", fd: int) -> None:
+        super().__init__(f"fake:{fd}")
+        self.world = world
+        self.fd = fd
+        self.takes = 1 << 30
+        self.inbox: list[Arrival] = []
+        self.sent: list[Frame] = []
+        self.sent_at: list[int] = []
+        self.reads: list[int] = []
+        self.is_away = False
+
+    def fileno(self) -> int:
+        return self.fd
+
+    def receive(self) -> list[Arrival]:
+        self.reads.append(self.world.now)
+        self.poll_at = NEVER
+        arrivals = self.inbox
+        self.inbox = []
+        return arrivals
+
+    def send(self, frame: Frame) -> bool:
+        if self.is_away:
+            self.lost += 1
+            return True
+        if self.takes == 0:
+            return False
+        self.takes -= 1
+        self.sent.append(frame)
+        self.sent_at.append(self.world.now)
+        return True
+
+    def close(self) -> None:
+        pass
+
+
+class World:
+    """A clock that only `wait` moves, and what happens when. oversleep: every wait ends this much late, ns."""
+
+    def __init__(self, channels: int = 1) -> None:
+        self.now = 0
+        self.oversleep = 0
+        self.channels = [FakeChannel(self, 10 + index) for index in range(channels)]
+        self.events: list[tuple[int, int, Callable[[], None]]] = []
+        self.waits: list[float] = []
+        self.ready: list[int] = []
+
+    def clock(self) -> int:
+        return EPOCH + self.now
+
+    def at(self, time: int, action: Callable[[], None]) -> None:
+        self.events.append((time, len(self.events), action))
+        self.events.sort()
+
+    def arrive(self, time: int, channel: int, frame: Frame, stamp: int = -1) -> None:
+        arrival = Arrival(time if stamp < 0 else stamp, frame, None)
+        self.at(time, lambda: self.channels[channel].inbox.append(arrival))
+
+    def wait(self, readers: list[int], writers: list[int], timeout_s: float) -> tuple[list[int], list[int]]:
+        """As select does: until something is ready or the time is over; here also until the next event."""
+        self.waits.append(timeout_s)
+        if not any(self.ready_of(readers, writers)):
+            end = self.now + round(timeout_s * 1e9)
+            if self.events and self.events[0][0] < end:
+                end = self.events[0][0]
+            self.now = max(self.now, end)
+        self.now += self.oversleep
+        while self.events and self.events[0][0] <= self.now:
+            self.events.pop(0)[2]()
+        return self.ready_of(readers, writers)
+
+    def ready_of(self, readers: list[int], writers: list[int]) -> tuple[list[int], list[int]]:
+        readable = [channel.fd for channel in self.channels if channel.inbox and channel.fd in readers]
+        readable += [fd for fd in self.ready if fd in readers]
+        return readable, [channel.fd for channel in self.channels if channel.takes and channel.fd in writers]
+
+    def loop(self, node: Node, ports: list[int], record: bool = False, measure_latency: bool = False) -> RealTimeLoop:
+        channels: list[Channel] = list(self.channels)
+        return RealTimeLoop(
+            node,
+            channels,
+            ports,
+            EPOCH,
+            record=record,
+            measure_latency=measure_latency,
+            clock=self.clock,
+            wait=self.wait,
+        )
+
+
+class Diary(Node):
+    """Writes down what it is called with; wakes every `period` ns."""
+
+    def __init__(self, period: int = NEVER) -> None:
+        super().__init__()
+        self.period = period
+        self.wake_at = period
+        self.rows: list[tuple[str, int, int]] = []
+        self.states: list[tuple[int, PortState]] = []
+
+    def receive(self, now: int, port: int, frame: Frame, out: Out) -> None:
+        self.rows.append(("frame", now, frame.can_id))
+
+    def wake(self, now: int, out: Out) -> None:
+        self.rows.append(("wake", now, 0))
+        self.wake_at += self.period
+
+    def port_changed(self, now: int, state: PortState, out: Out) -> None:
+        self.states.append((now, state))
+
+
+class Sender(Node):
+    """At 1 ms sends `frames` on `port`; writes down what it hears, with its port."""
+
+    def __init__(self, frames: list[Frame], port: int = 0) -> None:
+        super().__init__()
+        self.frames = frames
+        self.port = port
+        self.wake_at = MS
+        self.heard: list[tuple[int, int]] = []
+
+    def receive(self, now: int, port: int, frame: Frame, out: Out) -> None:
+        self.heard.append((port, frame.can_id))
+
+    def wake(self, now: int, out: Out) -> None:
+        self.wake_at = NEVER
+        for frame in self.frames:
+            out.send(self.port, frame)
+
+
+class Forwarder(Node):
+    """Port 0 to port 1 and back."""
+
+    def receive(self, now: int, port: int, frame: Frame, out: Out) -> None:
+        out.send(1 - port, frame)
+
+
+def until(world: World, end: int) -> Callable[[int], bool]:
+    world.at(end, lambda: None)  # the wait ends there
+    return lambda now: now >= end
+
+
+def test_wake_ups_before_a_stamp_come_first_with_their_own_time() -> None:
+    """Order, both loops: wake-ups due before now are served first, each with now = its wake_at, however late."""
+    world = World()
+    world.oversleep = 2_300_000
+    node = Diary(MS)
+    world.arrive(1_500_000, 0, Frame(0x10, b""))
+    world.loop(node, [0]).run(until(world, 3 * MS))
+    assert node.rows[:4] == [("wake", MS, 0), ("frame", 1_500_000, 0x10), ("wake", 2 * MS, 0), ("wake", 3 * MS, 0)]
+
+
+@pytest.mark.parametrize(("stamp", "first"), [(MS - 1, "frame"), (MS, "frame"), (MS + 1, "wake")])
+def test_frame_comes_before_a_wake_up_of_the_same_nanosecond(stamp: int, first: str) -> None:
+    """Order, both loops: at the same ns frame before wake-up."""
+    world = World()
+    world.oversleep = 10
+    node = Diary(MS)
+    world.arrive(stamp, 0, Frame(0x10, b""))
+    world.loop(node, [0]).run(until(world, MS + 1))
+    assert node.rows[0][0] == first
+    assert {row[0] for row in node.rows} == {"frame", "wake"}
+
+
+def test_frames_of_two_channels_are_served_by_stamp_then_channel() -> None:
+    """Order, both loops: time, then bus."""
+    world = World(2)
+    world.oversleep = 100
+    for channel, stamp, can_id in [(1, 50, 1), (0, 60, 2), (0, 70, 4), (1, 70, 3), (1, 80, 5)]:
+        world.arrive(50, channel, Frame(can_id, b""), stamp)
+    node = Diary()
+    world.loop(node, [0, 1]).run(until(world, 200))
+    assert node.rows == [("frame", 50, 1), ("frame", 60, 2), ("frame", 70, 4), ("frame", 70, 3), ("frame", 80, 5)]
+
+
+@pytest.mark.parametrize("other", [False, True])
+def test_one_channel_keeps_its_order_whatever_its_stamps(other: bool) -> None:
+    """No reordering without a fault: equal stamps and stamps that go back do not change the order of arrival."""
+    world = World(2)
+    world.oversleep = 100
+    for stamp, can_id in [(70, 9), (70, 3), (65, 1), (80, 2)]:
+        world.arrive(10, 0, Frame(can_id, b""), stamp)
+    if other:
+        world.arrive(10, 1, Frame(0x700, b""), 71)
+    node = Diary()
+    world.loop(node, [0, 1]).run(until(world, 200))
+    assert [row[2] for row in node.rows if row[2] != 0x700] == [9, 3, 1, 2]
+
+
+def test_time_never_goes_back_for_the_node_and_the_trace_keeps_the_stamp() -> None:
+    """A frame that comes after a later wake-up was served gets that time; its row says when it was stamped."""
+    world = World()
+    node = Diary(MS)
+    world.arrive(MS + 500, 0, Frame(0x10, b""), stamp=MS - 20)
+    loop = world.loop(node, [0], record=True)
+    loop.run(until(world, MS + 500))
+    assert node.rows == [("wake", MS, 0), ("frame", MS, 0x10)]
+    assert loop.trace is not None
+    assert [(row.end_ns, row.bus, row.sender) for row in loop.trace] == [(MS - 20, 0, RECEIVED)]
+
+
+def test_stamp_in_the_future_does_not_wake_the_node_early() -> None:
+    """A clock elsewhere that is wrong must not drive this node's timers."""
+    world = World()
+    node = Diary(MS)
+    world.arrive(100, 0, Frame(0x10, b""), stamp=5 * MS)
+    world.loop(node, [0]).run(until(world, 200))
+    assert node.rows == [("frame", 100, 0x10)]
+
+
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 5000), st.integers(0, 1), st.integers(0, 2000)),
+        max_size=40,
+    ),
+    st.integers(1, 900),
+    st.integers(0, 3000),
+)
+def test_any_traffic_is_served_once_in_order(
+    plan: list[tuple[int, int, int]], period: int, oversleep: int
+) -> None:
+    """Nothing lost, time never back for frames, wake-ups each at their time, each channel's order kept."""
+    world = World(2)
+    world.oversleep = oversleep
+    plan.sort(key=lambda entry: entry[0])
+    for number, (time, channel, age) in enumerate(plan):
+        world.arrive(time, channel, Frame(number, b""), stamp=max(time - age, 0))
+    node = Diary(period)
+    world.loop(node, [0, 1]).run(until(world, 20_000))
+    times = [row[1] for row in node.rows]
+    assert times == sorted(times)
+    wakes = [row[1] for row in node.rows if row[0] == "wake"]
+    assert wakes == [period * (index + 1) for index in range(len(wakes))]
+    for channel in (0, 1):
+        expected = [number for number, entry in enumerate(plan) if entry[1] == channel]
+        assert [row[2] for row in node.rows if row[0] == "frame" and row[2] in expected] == expected
+
+
+def test_lateness_is_time_served_minus_wake_at() -> None:
+    """Lateness is measured and reported as a distribution."""
+    world = World()
+    world.oversleep = 1_250_000
+    node = Diary(MS)
+    loop = world.loop(node, [0])
+    loop.run(until(world, 2 * MS))
+    assert node.rows == [("wake", MS, 0), ("wake", 2 * MS, 0)]
+    assert (loop.lateness.count, loop.lateness.worst_ns) == (2, 1_250_000)
+    assert loop.lateness.percentile(0.5) < 300_000  # the second was 250 us late; a bin is 12.5 % wide
+
+
+def test_until_is_asked_every_50_ms() -> None:
+    """A stop is noticed although nothing happens on the bus."""
+    world = World()
+    asked: list[int] = []
+
+    def stop(now: int) -> bool:
+        asked.append(now)
+        return now >= 200 * MS
+
+    world.loop(Diary(), [0]).run(stop)
+    assert asked == [0, 50 * MS, 100 * MS, 150 * MS, 200 * MS]
+
+
+def test_node_that_does_not_move_its_wake_at_is_refused() -> None:
+    """A programming error raises, it does not spin."""
+    world = World()
+    with pytest.raises(CanopenExoError, match="must move wake_at on"):
+        world.loop(Diary(0), [0]).run(until(world, MS))
+
+
+def test_port_without_channel_is_refused() -> None:
+    """The message says which port, which channel and what is allowed."""
+    with pytest.raises(CanopenExoError, match=r"port 1 is to use channel 2, allowed 0\.\.1"):
+        World(2).loop(Diary(), [0, 2])
+
+
+FRAMES = [Frame(0x300, b"\x01"), Frame(0x100, b"\x02"), Frame(0x300, b"\x03"), Frame(0x080, b"\x04")]
+
+
+def test_frames_go_to_the_interface_at_once_in_the_order_given() -> None:
+    """Arbitration among frames that do not wait is the bus's matter."""
+    world = World()
+    world.loop(Sender(FRAMES), [0]).run(until(world, 2 * MS))
+    assert world.channels[0].sent == FRAMES
+
+
+def test_frames_that_must_wait_go_by_arbitration_and_keep_the_order_within_an_id() -> None:
+    """A port's transmit queue: the lowest arbitration bits first, as in the medium."""
+    world = World()
+    channel = world.channels[0]
+    channel.takes = 1
+    world.at(5 * MS, lambda: setattr(channel, "takes", 9))
+    world.loop(Sender(FRAMES), [0]).run(until(world, 6 * MS))
+    assert channel.sent == [FRAMES[0], FRAMES[3], FRAMES[1], FRAMES[2]]
+    assert channel.sent_at == [MS, 5 * MS, 5 * MS, 5 * MS]
+
+
+def test_frame_sent_while_others_wait_does_not_overtake_its_own_id() -> None:
+    """Writable again, but the queue first: order within an id survives."""
+    world = World()
+    channel = world.channels[0]
+    channel.takes = 0
+
+    class Twice(Sender):
+        def wake(self, now: int, out: Out) -> None:
+            super().wake(now, out)
+            channel.takes = 9
+            out.send(0, Frame(0x300, b"\x09"))
+
+    world.loop(Twice(FRAMES), [0]).run(until(world, 2 * MS))
+    assert [frame.data for frame in channel.sent if frame.can_id == 0x300] == [b"\x01", b"\x03", b"\x09"]
+
+
+def test_blocked_interface_is_waited_for_and_not_asked_again_and_again() -> None:
+    """select says when it is writable; between, no turn is spent."""
+    world = World()
+    world.channels[0].takes = 0
+    world.loop(Sender(FRAMES), [0]).run(until(world, 201 * MS))
+    assert len(world.waits) <= 6
+
+
+def test_interface_that_names_a_time_is_asked_then() -> None:
+    """ENOBUFS: select would call the socket writable; `send_at` says when to try again."""
+    world = World()
+    channel = world.channels[0]
+    channel.takes = 0
+    channel.send_at = MS + 300_000
+    world.at(MS + 1, lambda: setattr(channel, "takes", 9))
+    world.loop(Sender(FRAMES[:1]), [0]).run(until(world, 2 * MS))
+    assert channel.sent_at == [MS + 300_000]
+
+
+@pytest.mark.parametrize("extra", [0, 1, 3])
+def test_queue_holds_64_frames_and_counts_what_it_drops(extra: int) -> None:
+    """Overflow drops the newest frame, is counted per port, and shows among the losses."""
+    world = World()
+    channel = world.channels[0]
+    channel.takes = 0
+    frames = [Frame(0x200, bytes((number,))) for number in range(QUEUE_LENGTH + extra)]
+    loop = world.loop(Sender(frames), [0])
+    loop.run(until(world, 2 * MS))
+    assert loop.dropped == [extra]
+    assert loop.losses() == extra
+    channel.takes = 1 << 30
+    loop.run(until(world, 3 * MS))
+    assert channel.sent == frames[:QUEUE_LENGTH]
+
+
+def test_losses_add_up_what_queues_kernel_and_interfaces_lost() -> None:
+    """A frame lost anywhere makes the run invalid."""
+    world = World(2)
+    world.channels[0].overruns = 3
+    world.channels[1].lost = 4
+    assert world.loop(Diary(), [0, 1]).losses() == 7
+
+
+def test_own_frame_reaches_another_port_on_the_same_channel_once() -> None:
+    """On a real interface all drives share a socket; frames sent by one are delivered to the others."""
+    world = World()
+    node = Sender(FRAMES[:1], port=0)
+    world.loop(node, [0, 0, 0]).run(until(world, 2 * MS))
+    assert node.heard == [(1, 0x300)]
+    node = Sender(FRAMES[:1], port=2)
+    world = World()
+    world.loop(node, [0, 0, 0]).run(until(world, 2 * MS))
+    assert node.heard == [(0, 0x300)]
+
+
+def test_own_frame_comes_back_neither_on_its_port_nor_from_another_bus() -> None:
+    """A gateway's ports are on different channels: nothing of its own returns to it."""
+    world = World(2)
+    node = Sender(FRAMES)
+    world.loop(node, [0, 1]).run(until(world, 2 * MS))
+    assert node.heard == []
+
+
+def test_frame_that_the_interface_lost_reaches_no_other_port() -> None:
+    """A bus that is away delivers to nobody."""
+    world = World()
+    world.channels[0].is_away = True
+    node = Sender(FRAMES[:1])
+    loop = world.loop(node, [0, 0], record=True)
+    loop.run(until(world, 2 * MS))
+    assert node.heard == []
+    assert loop.trace == []
+    assert loop.losses() == 1
+
+
+def test_received_frame_goes_to_the_first_port_of_its_channel() -> None:
+    """One call per frame, whatever the number of ports on the channel."""
+    world = World(2)
+    node = Sender([])
+    world.arrive(10, 1, Frame(0x55, b""))
+    world.loop(node, [0, 1, 1]).run(until(world, MS))
+    assert node.heard == [(1, 0x55)]
+
+
+def test_notice_reaches_every_port_of_the_channel_with_its_number() -> None:
+    """PortState(port, ...) is the only error notice to nodes."""
+    world = World(2)
+    node = Diary()
+    notice = Arrival(300, None, PortState(0, ErrorState.BUS_OFF, 255, 3, "bus-off"))
+    world.at(300, lambda: world.channels[1].inbox.append(notice))
+    world.loop(node, [0, 1, 1]).run(until(world, MS))
+    assert [(now, state.port, state.state, state.tec, state.rec, state.cause) for now, state in node.states] == [
+        (300, port, ErrorState.BUS_OFF, 255, 3, "bus-off") for port in (1, 2)
+    ]
+
+
+def test_channel_without_descriptor_is_polled_when_it_asks() -> None:
+    """Reopening with a back-off is the channel's matter; the loop calls it at `poll_at`."""
+    world = World()
+    channel = world.channels[0]
+    channel.fd = -1
+    channel.poll_at = 20 * MS
+    world.loop(Diary(), [0]).run(until(world, 30 * MS))
+    assert channel.reads == [20 * MS]
+
+
+def test_frame_for_a_channel_without_descriptor_is_offered_again_soon() -> None:
+    """select cannot tell when it is writable."""
+    world = World()
+    channel = world.channels[0]
+    channel.fd = -1
+    channel.takes = 0
+    world.at(3 * MS, lambda: setattr(channel, "takes", 1))
+    world.loop(Sender(FRAMES[:1]), [0]).run(until(world, 9 * MS))
+    assert len(channel.sent) == 1
+    assert channel.sent_at[0] <= 4 * MS
+
+
+def test_trace_holds_own_frames_with_port_and_time_of_sending() -> None:
+    """Received frames with their stamp, sent frames with the time of sending; bus = channel."""
+    world = World(2)
+    loop = world.loop(Forwarder(), [1, 0], record=True)
+    world.oversleep = 40
+    world.arrive(1000, 0, Frame(0x123, b"\x01"))
+    loop.run(until(world, 2000))
+    assert loop.trace is not None
+    rows = [(row.end_ns, row.bus, row.sender, row.frame.can_id) for row in loop.trace]
+    assert rows == [(1000, 0, RECEIVED, 0x123), (1040, 1, 0, 0x123)]
+
+
+def test_trace_is_kept_only_when_asked_for() -> None:
+    """A gateway that runs for days does not grow."""
+    world = World()
+    loop = world.loop(Sender(FRAMES), [0])
+    loop.run(until(world, 2 * MS))
+    assert loop.trace is None
+
+
+def test_latency_is_from_stamp_to_sending_by_channel() -> None:
+    """Added latency of a gateway, waiting in its queue included; frames sent by a timer do not count."""
+    world = World(2)
+    world.oversleep = 250
+    loop = world.loop(Forwarder(), [0, 1], measure_latency=True)
+    world.arrive(1000, 0, Frame(0x123, b"\x01"))
+    loop.run(until(world, 2000))
+    assert [latency.count for latency in loop.latency] == [0, 1]
+    assert loop.latency[1].worst_ns == 250
+    world.channels[0].takes = 0
+    world.arrive(10_000, 1, Frame(0x123, b"\x01"))
+    world.at(50_000, lambda: setattr(world.channels[0], "takes", 1))
+    loop.run(until(world, 60_000))
+    assert loop.latency[0].worst_ns == 40_250
+    timed = world.loop(Sender(FRAMES), [1], measure_latency=True)
+    timed.run(until(world, 2 * MS))
+    assert timed.latency[1].count == 0
+
+
+def test_further_reader_is_called_with_the_time_until_removed() -> None:
+    """Live control calls between two calls of the node; the loop's select takes further readable files."""
+    world = World()
+    loop = world.loop(Diary(), [0])
+    calls: list[int] = []
+    left, right = socket.socketpair()
+    with left, right:
+
+        def answer(now: int) -> None:
+            calls.append(now)
+            loop.remove_reader(left)
+            world.ready.clear()
+
+        loop.add_reader(left, answer)
+        world.at(3 * MS, lambda: world.ready.append(left.fileno()))
+        world.at(6 * MS, lambda: world.ready.append(left.fileno()))
+        loop.run(until(world, 10 * MS))
+    assert calls == [3 * MS]
+
+
+def test_real_select_serves_a_reader_and_ends() -> None:
+    """The same on the machine's own clock and select: no fake in between."""
+    calls: list[int] = []
+    left, right = socket.socketpair()
+    with left, right:
+        loop = RealTimeLoop(Diary(), [], [], 0)
+        loop.add_reader(left, lambda now: calls.append(len(left.recv(10))))
+        right.send(b"abc")
+        loop.run(lambda now: bool(calls))
+    assert calls == [3]
+
+
+def test_garbage_collection_is_as_before_after_a_run() -> None:
+    """It rests while the loop runs, also when the node raises."""
+    assert gc.isenabled()
+    seen: list[bool] = []
+    world = World()
+
+    def stop(now: int) -> bool:
+        seen.append(gc.isenabled())
+        return True
+
+    world.loop(Diary(), [0]).run(stop)
+    assert seen == [False]
+    assert gc.isenabled()
+    with pytest.raises(CanopenExoError):
+        World().loop(Diary(0), [0]).run(lambda now: False)
+    assert gc.isenabled()

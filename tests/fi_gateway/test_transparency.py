@@ -1,0 +1,387 @@
+"""The gateway on real interfaces: real sockets with the kernel's CAN records on them, served by the real-time loop.
+
+The records are made here by hand from linux/can.h, byte for byte, and compared byte for byte: nothing of our codec is
+in the comparison. Socket pairs take the place of AF_CAN, which is tried out in tests/vcan.
+"""
+
+import errno
+import random
+import select
+import socket
+import struct
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Final
+
+import pytest
+
+from canopen_exo.bus.frame import Frame
+from canopen_exo.bus.hub import HubServer, listen
+from canopen_exo.bus.hub_client import HubChannel
+from canopen_exo.bus.node import NEVER, SECOND, ErrorState
+from canopen_exo.bus.realtime import RealTimeLoop
+from canopen_exo.bus.socketcan import SocketCanChannel
+from fi_gateway.control import statistics
+from fi_gateway.effects import Infinite
+from fi_gateway.events import At
+from fi_gateway.faults import BitFlip, Drop
+from fi_gateway.gateway import CONTROLLER_PORT, DRIVE_PORT, Gateway
+from fi_gateway.injector import Injector, Target, stream
+
+ROOT: Final = Path(__file__).resolve().parents[2]
+
+EXTENDED, REMOTE, ERROR = 0x80000000, 0x40000000, 0x20000000
+FDF, BRS, ESI = 4, 1, 2
+FD_LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
+PATIENCE_NS = 20 * SECOND
+"""A busy machine; only a gateway that loses a frame makes a test wait this long."""
+
+
+def classical(can_id: int, data: bytes = b"", raw_dlc: int = 0, length: int | None = None) -> bytes:
+    """struct can_frame: id, len, pad, reserved, len8_dlc, 8 data bytes."""
+    return struct.pack("=IBBBB8s", can_id, len(data) if length is None else length, 0, 0, raw_dlc, data)
+
+
+def fd(can_id: int, data: bytes, flags: int) -> bytes:
+    """struct canfd_frame: id, len, flags, 2 reserved, 64 data bytes; FDF as kernels set it on what they receive."""
+    return struct.pack("=IBBBB64s", can_id, len(data), flags | FDF, 0, 0, data)
+
+
+def kinds() -> list[bytes]:
+    """Every kind of frame there is, each with its own content."""
+    numbers = (0, 1, 0x80, 0x185, 0x2FF, 0x6C0, 0x7FF)
+    data = bytes(range(0xA1, 0xA1 + 64))
+    found = [classical(number, data[:length]) for number in numbers for length in range(9)]
+    found += [classical(number, data[:8], raw) for number in numbers for raw in range(9, 16)]
+    found += [classical(number | REMOTE, length=length) for number in numbers for length in range(9)]
+    found += [classical(number | REMOTE, raw_dlc=raw, length=8) for number in numbers for raw in range(9, 16)]
+    for number in (0, 0x185, 0x7FF, 0x800, 0x1FFFFFFF):
+        found += [classical(number | EXTENDED, data[:length]) for length in range(9)]
+        found += [classical(number | EXTENDED, data[:8], 15), classical(number | EXTENDED | REMOTE, length=3)]
+    for number in (0, 0x185, 0x7FF, 0x185 | EXTENDED, 0x1FFFFFFF | EXTENDED):
+        for flags in (0, BRS, ESI, BRS | ESI):
+            found += [fd(number, data[:length], flags) for length in FD_LENGTHS]
+    return found
+
+
+def injector(name: str, cob_id: int, fault: Drop | BitFlip) -> Injector:
+    return Injector(
+        name, Target(True, True, (cob_id,)), fault, At((0,)), Infinite(), None, stream(1, 0, name), True, True
+    )
+
+
+class Bench:
+    """A gateway between two interfaces, and the far ends of both. far[p]: what is connected to the gateway's port p."""
+
+    def __init__(self, injectors: list[Injector]) -> None:
+        self.gateway = Gateway(injectors, 2_000_000)
+        self.far: list[socket.socket] = []
+        self.channels: list[SocketCanChannel] = []
+        self.came: list[list[bytes]] = [[], []]
+        for name in ("controller", "drive"):
+            near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+            far.setblocking(False)
+            self.far.append(far)
+            self.channels.append(SocketCanChannel(f"socketcan:{name}", near.dup))
+            near.close()
+        self.loop = RealTimeLoop(
+            self.gateway, list(self.channels), [0, 1], time.monotonic_ns(), record=True, measure_latency=True
+        )
+
+    def pass_all(self, given: list[list[bytes]], expected: list[int]) -> None:
+        """Offer four records of each side a turn, until the expected numbers have come out, and then a few turns more.
+
+        Four, so that no frame has to wait for a socket: what waits goes by arbitration, as in any CAN controller.
+        """
+        at, turns = [0, 0], 0
+
+        def feed(now: int) -> bool:
+            nonlocal turns
+            for port in (0, 1):
+                for record in given[port][at[port] : at[port] + 4]:
+                    self.far[port].send(record)
+                at[port] += 4
+                self._drain(port)
+            if all(at[port] >= len(given[port]) and len(self.came[port]) >= expected[port] for port in (0, 1)):
+                turns += 1
+            return now > limit or turns > 3
+
+        limit = self.loop.now() + PATIENCE_NS
+        self.loop.run(feed)
+
+    def _drain(self, port: int) -> None:
+        try:
+            while True:
+                self.came[port].append(self.far[port].recv(72))
+        except BlockingIOError:
+            pass
+
+    def close(self) -> None:
+        for channel in self.channels:
+            channel.close()
+        for far in self.far:
+            far.close()
+
+
+@contextmanager
+def bench(*injectors: Injector) -> Iterator[Bench]:
+    made = Bench(list(injectors))
+    try:
+        yield made
+    finally:
+        made.close()
+
+
+def test_every_kind_of_frame_passes_both_ways_byte_for_byte() -> None:
+    """Id type, DLC (raw ones too), RTR, FD, BRS and ESI kept; in order; nothing comes back to where it came from."""
+    records = kinds()
+    with bench() as made:
+        made.pass_all([records, records[::-1]], [len(records)] * 2)
+        assert made.came[DRIVE_PORT] == records
+        assert made.came[CONTROLLER_PORT] == records[::-1]
+        assert made.gateway.frames == [len(records)] * 2
+        assert made.loop.losses() == 0
+
+
+def test_armed_faults_elsewhere_change_nothing() -> None:
+    """A fault acts on classical data frames of its target; every other kind with the same id passes."""
+    records = [record for record in kinds() if struct.unpack_from("=I", record)[0] != 0x185 or len(record) == 72]
+    target = [injector("drop", 0x185, Drop()), injector("flip", 0x123, BitFlip(None, 1))]
+    with bench(*target) as made:
+        made.pass_all([[], [classical(0x701, b"\0"), *records]], [1 + len(records), 0])
+        assert [one.phase.value for one in target] == ["active", "active"]
+        assert made.came == [[classical(0x701, b"\0"), *records], []]
+
+
+def test_error_frames_are_counted_reported_and_not_forwarded() -> None:
+    """design.md: SocketCAN error frames become PortState notices; bus-off to restart as linux/can/error.h has it."""
+    passive = classical(ERROR | 0x204, bytes((0, 0x20, 0, 0, 0, 0, 130, 7)))
+    bus_off = classical(ERROR | 0x40, bytes(8))
+    restarted = classical(ERROR | 0x100, bytes(8))
+    frames = [classical(0x100 + number, b"\1") for number in range(4)]
+    with bench() as made:
+        came = [frames[0], passive, frames[1], bus_off, restarted, frames[2], passive, frames[3]]
+        made.pass_all([[], came], [4, 0])
+        assert made.came == [frames, []]
+        assert [change.state for change in made.gateway.port_changes] == [
+            ErrorState.ERROR_PASSIVE,
+            ErrorState.BUS_OFF,
+            ErrorState.ERROR_ACTIVE,
+            ErrorState.ERROR_PASSIVE,
+        ]
+        assert {change.port for change in made.gateway.port_changes} == {DRIVE_PORT}
+        to_drives, to_controller = statistics(made.gateway, made.loop.latency)
+        assert (to_drives.notices, to_controller.notices) == (0, 4)
+        assert made.channels[DRIVE_PORT].errors == 4
+
+
+def test_records_that_are_no_frames_are_counted_and_not_forwarded() -> None:
+    """Bad bytes are data: nothing raises, the frames around them pass."""
+    good = [classical(0x100, b"\1"), classical(0x101, b"\2")]
+    bad = [b"x", bytes(15), bytes(17), classical(0x100, bytes(8), length=9), bytes(71)]
+    with bench() as made:
+        made.pass_all([[good[0], *bad, good[1]], []], [0, 2])
+        assert made.came == [[], good]
+        assert made.channels[CONTROLLER_PORT].malformed == len(bad)
+
+
+def test_bus_off_on_one_side_loses_what_is_sent_there_and_ends_by_itself() -> None:
+    """Counted as undelivered, nothing old comes out afterwards; the other direction goes on."""
+    away = [classical(0x200 + number, bytes((number,))) for number in range(5)]
+    back = [classical(0x300, b"\7")]
+    with bench() as made:
+        made.pass_all([[], [classical(ERROR | 0x40, bytes(8))]], [0, 0])
+        made.gateway._probe_at[DRIVE_PORT] = NEVER  # a slow machine must not reach the first probe
+        made.pass_all([away, []], [0, 0])
+        assert made.gateway.undelivered == [5, 0]
+        made.pass_all([[], [classical(ERROR | 0x100, bytes(8))]], [0, 0])
+        made.pass_all([back, [classical(0x181, b"\1")]], [1, 1])
+        assert made.came == [[classical(0x181, b"\1")], back]
+
+
+def test_latency_is_measured_for_every_frame_sent() -> None:
+    """From the stamp of the frame to its sending, by direction."""
+    with bench() as made:
+        made.pass_all([[classical(0x200, b"\1")] * 7, [classical(0x180, b"\1")] * 5], [5, 7])
+        to_drives, to_controller = statistics(made.gateway, made.loop.latency)
+        assert to_drives.latency is not None
+        assert to_controller.latency is not None
+        assert (to_drives.latency.count, to_controller.latency.count) == (7, 5)
+        assert 0 <= to_drives.latency.percentile(0.5) <= to_drives.latency.worst_ns
+
+
+def test_an_interface_that_goes_away_and_comes_back_is_survived() -> None:
+    """ENODEV: reported, opened again with back-off; the gateway resumes without being told."""
+
+    class Gone(socket.socket):
+        """A socket whose interface has been pulled out."""
+
+        def recvmsg(self, *_: object) -> tuple[bytes, list[tuple[int, int, bytes]], int, object]:
+            raise OSError(errno.ENODEV, "No such device")
+
+    with bench() as made:
+        near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+        broken, trigger = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+        opened: list[socket.socket] = [Gone(fileno=broken.detach()), near]
+        unstable = SocketCanChannel("socketcan:unstable", lambda: opened.pop(0))
+        made.loop = RealTimeLoop(made.gateway, [made.channels[0], unstable], [0, 1], time.monotonic_ns())
+        made.far[DRIVE_PORT].close()
+        made.far[DRIVE_PORT] = far
+        far.setblocking(False)
+        trigger.send(b"x")
+        limit = made.loop.now() + PATIENCE_NS
+        made.loop.run(lambda now: now > limit or (not opened and unstable.fileno() >= 0))
+        assert [change.state for change in made.gateway.port_changes] == [ErrorState.DOWN]
+        frame = classical(0x200, b"\1")
+
+        def repeat(now: int) -> bool:
+            if select.select([far], [], [], 0)[0]:
+                return True
+            made.far[CONTROLLER_PORT].send(frame)
+            return now > limit
+
+        made.loop.run(repeat)
+        assert far.recv(72) == frame
+        made.loop.run(lambda now: now > limit or len(made.gateway.port_changes) > 1)
+        assert made.gateway.port_changes[-1].state is ErrorState.ERROR_ACTIVE
+        unstable.close()
+        trigger.close()
+
+
+def test_no_frame_is_lost_doubled_or_moved_in_a_long_stream() -> None:
+    """None without a fault asking for it: 20 000 random frames, both ways; `make soak` takes 10 million."""
+    chance = random.Random(11)
+    pool = kinds()
+    given: list[list[bytes]] = [[], []]
+    for number in range(20_000):
+        record = bytearray(chance.choice(pool))
+        size = record[4] if len(record) == 72 or not record[3] & 0x40 else 0
+        if size >= 4:
+            record[8:12] = number.to_bytes(4, "little")
+        given[number % 2].append(bytes(record))
+    with bench(injector("drop", 0x555, Drop())) as made:
+        made.pass_all(given, [len(given[1]), len(given[0])])
+        assert made.came[DRIVE_PORT] == given[CONTROLLER_PORT]
+        assert made.came[CONTROLLER_PORT] == given[DRIVE_PORT]
+        assert (made.loop.losses(), made.gateway.lost, made.gateway.undelivered) == (0, [0, 0], [0, 0])
+
+
+# ---- the soak recipe ----------------------------------------------------------------------------------------------
+
+
+def test_the_soak_recipe_runs() -> None:
+    """`make soak` in small: a gateway in a process of its own, 50 000 frames, every record compared with its due."""
+    command = [sys.executable, "-m", "benchmarks.soak", "--frames", "50000", "--seconds", "0"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "50000 frames" in done.stdout
+
+
+@pytest.mark.parametrize("towards_controller", [False, True])
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        (lambda records: records[:5] + records[6:], "1 frames lost or overtaken"),
+        (lambda records: [*records[:6], records[5], *records[6:]], "doubled or changed"),
+        (lambda records: [*records[:5], records[6], records[5], *records[7:]], "lost or overtaken"),
+        (lambda records: [*records[:5], records[5][:-1] + b"x", *records[6:]], "doubled or changed"),
+    ],
+)
+def test_the_soak_recipe_sees_what_it_is_there_for(
+    monkeypatch: pytest.MonkeyPatch,
+    change: Callable[[list[bytes]], list[bytes]],
+    complaint: str,
+    towards_controller: bool,
+) -> None:
+    """Lost, doubled, out of order, changed: each ends the run with the number of the frame."""
+    monkeypatch.syspath_prepend(str(ROOT))
+    from benchmarks.soak import Stream
+
+    pairs = [socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM) for _ in range(2)]
+    for pair in pairs:
+        for end in pair:
+            end.setblocking(False)
+    stream = Stream(pairs[0][0], pairs[1][1], towards_controller, 20)
+    for _ in range(20):
+        stream.send()
+    records = [pairs[0][1].recv(72) for _ in range(20)]
+    for record in change(records):
+        pairs[1][0].send(record)
+    with pytest.raises(SystemExit, match=complaint):
+        stream.receive()
+    for pair in pairs:
+        for end in pair:
+            end.close()
+
+
+# ---- no reflection, on a bus with others on it --------------------------------------------------------------------
+
+
+@contextmanager
+def hub() -> Iterator[str]:
+    """A fast hub in a thread; its address."""
+    server = HubServer(listen("127.0.0.1", 0), 0)
+    stop, stopper = socket.socketpair()
+
+    def serve() -> None:
+        while server.serve(stop):
+            pass
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    try:
+        yield server.address()
+    finally:
+        stopper.send(b"x")
+        thread.join()
+        server.close()
+        stop.close()
+        stopper.close()
+
+
+def collect(channel: HubChannel, into: list[Frame]) -> None:
+    into.extend(arrival.frame for arrival in channel.receive() if arrival.frame is not None)
+
+
+def test_own_traffic_is_never_forwarded_again() -> None:
+    """No reflection loop: on two buses with others on them, every frame appears once on each bus, then there is peace.
+
+    Each side has a sender and a listener; the listener on the sender's own bus hears it once as well.
+    """
+    frames = [[Frame(0x200 + number, bytes((port, number))) for number in range(50)] for port in (0, 1)]
+    with hub() as address:
+        names = [f"{address}/{name}" for name in ("controller", "drive")]
+        gateway = Gateway([], 2_000_000)
+        near, senders, listeners = ([HubChannel(name) for name in names] for _ in range(3))
+        for channel in (*near, *senders, *listeners):
+            channel.open()
+        loop = RealTimeLoop(gateway, list(near), [0, 1], time.monotonic_ns())
+        heard: list[list[Frame]] = [[], []]
+        echoed: list[list[Frame]] = [[], []]
+        for port in (0, 1):
+            for frame in frames[port]:
+                assert senders[port].send(frame)
+
+        def gather(done: Callable[[], bool], limit: int) -> None:
+            def look(now: int) -> bool:
+                for port in (0, 1):
+                    collect(listeners[port], heard[port])
+                    collect(senders[port], echoed[port])
+                return now > limit or done()
+
+            loop.run(look)
+
+        gather(lambda: all(len(one) >= 100 for one in heard), loop.now() + PATIENCE_NS)
+        gather(lambda: False, loop.now() + SECOND // 5)  # a loop would go on for ever
+        for port in (0, 1):
+            assert [frame for frame in heard[port] if frame.data[0] == port] == frames[port]
+            assert [frame for frame in heard[port] if frame.data[0] != port] == frames[1 - port]
+            assert echoed[port] == frames[1 - port]
+        assert gateway.frames == [50, 50]
+        for channel in (*near, *senders, *listeners):
+            channel.close()

@@ -1,0 +1,404 @@
+"""Parts put together, held against a lock-step run: cut into parts, it must come out of the merge as it went in."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from canopen_exo.bus.lateness import Lateness
+from canopen_exo.bus.medium import Transmission
+from canopen_exo.bus.node import MS, NEVER
+from fi_gateway.injector import Injector
+from fi_gateway.schema import build_injectors
+from testbench.merge import IncompleteError, merge
+from testbench.parts import ControlNote, GatewayPart, HlcPart, JointsPart, NotedEvent, Service
+from testbench.record import RunRecord
+from testbench.rig import CONTROLLER_BUS, DRIVE_BUS, Rig, build_rig
+from testbench.run import drive_through, record_of, rig_params
+from testbench.scenario import Scenario, parse_scenario
+from testbench.timing import Timing, TimingLimits, judge_timing
+
+SCENARIO = """\
+name: parts
+rig: {plant: suspended, stops: off, rate: 100 Hz}
+motion: {gait: walking, stride: 1.5 s, duration: 1 s}
+injectors:
+  bias:
+    target: {bus: to_controller, node: right_knee, signal: position}
+    fault: {type: bias, value: 0.05 rad}
+    event: {type: at, time: 0.3 s}
+    effect: {type: constant_time, duration: 0.2 s}
+  lost:
+    target: {bus: to_drives, node: left_hip, pdo: RPDO1}
+    fault: {type: drop}
+    event: {type: at, time: 0.6 s}
+    effect: {type: constant_time, duration: 0.05 s}
+"""
+
+Parts = tuple[HlcPart, GatewayPart, JointsPart]
+
+
+def service() -> Service:
+    return Service(0, 0, Lateness(), {})
+
+
+def seen_by(rig: Rig, bus: int, index: int, own: dict[int, int]) -> list[tuple[int, Transmission]]:
+    """Rows of one bus as a process saw them. own: its senders on the medium -> the port it sent on."""
+    return [
+        (place, Transmission(row.end_ns, index, row.frame, own.get(row.sender, -1)))
+        for place, row in enumerate(rig.loop.trace)
+        if row.bus == bus
+    ]
+
+
+def parts_of(rig: Rig) -> Parts:
+    """A lock-step run, as its processes would have left it."""
+    controller, count = rig.controller, len(rig.rack.devices)
+    table = {
+        name: np.array([getattr(sample, name) for sample in controller.samples])
+        for name in ("q_d", "dq_d", "tau_command")
+    }
+    truth = {name: np.array([getattr(row, name) for row in rig.rack.truth]) for name in ("q", "dq", "tau")}
+    hlc = HlcPart(
+        service(),
+        controller.time_zero,
+        controller.completed,
+        list(controller.late),
+        [NotedEvent(one.time_ns, one.joint, one.kind, one.text) for one in controller.events],
+        np.array([sample.cycle for sample in controller.samples]),
+        table["q_d"],
+        table["dq_d"],
+        table["tau_command"],
+        [row for _, row in seen_by(rig, CONTROLLER_BUS, 0, {0: 0})],
+    )
+    gateway_rows = seen_by(rig, CONTROLLER_BUS, 0, {1: 0}) + seen_by(rig, DRIVE_BUS, 1, {0: 1})
+    gateway = GatewayPart(
+        service(),
+        rig.gateway.time_zero,
+        len(rig.gateway.injectors),
+        list(rig.gateway.frames),
+        list(rig.gateway.lost),
+        [Lateness(), Lateness()],
+        rig.gateway.records,
+        [],
+        [row for _, row in sorted(gateway_rows, key=lambda pair: pair[0])],
+    )
+    joints = JointsPart(
+        service(),
+        np.array([row.time_ns for row in rig.rack.truth]),
+        truth["q"],
+        truth["dq"],
+        truth["tau"],
+        [row for _, row in seen_by(rig, DRIVE_BUS, 0, {port + 1: port for port in range(count)})],
+    )
+    return hlc, gateway, joints
+
+
+@pytest.fixture(scope="module")
+def scenario() -> Scenario:
+    return parse_scenario(SCENARIO)
+
+
+@pytest.fixture(scope="module")
+def rig(scenario: Scenario) -> Rig:
+    injectors: list[Injector] = build_injectors(scenario.injectors, scenario.plan, scenario.seed, 0)
+    made = build_rig(rig_params(scenario), injectors)
+    drive_through(made, lambda share: None)
+    return made
+
+
+@pytest.fixture(scope="module")
+def expected(rig: Rig) -> RunRecord:
+    return record_of(rig)
+
+
+@pytest.fixture(scope="module")
+def parts(rig: Rig) -> Parts:
+    return parts_of(rig)
+
+
+def test_parts_of_a_run_make_its_record(scenario: Scenario, rig: Rig, expected: RunRecord, parts: Parts) -> None:
+    """Design: `run --realtime` gives the same result document as lock-step."""
+    found = merge(scenario.plan, expected.duration_ns, *parts, [])
+    for name in ("t_s", "q", "dq", "tau"):
+        assert np.array_equal(getattr(found.truth, name), getattr(expected.truth, name))
+    for name in ("t_s", "q_ref", "dq_ref", "tau_command"):
+        assert np.array_equal(getattr(found.commands, name), getattr(expected.commands, name))
+    assert found.time0_ns == expected.time0_ns
+    assert found.notes == expected.notes
+    assert (found.completed, found.held_cycles, found.source) == (True, expected.held_cycles, "plant")
+    assert len(found.activations) == 2
+    for one, other in zip(found.buses, expected.buses, strict=True):
+        assert (one.name, one.frames, one.queue_overflows) == (other.name, other.frames, 0)
+        assert one.load == pytest.approx(other.load, rel=1e-12)  # sums of the same bits, in another unit
+    assert sorted(row.end_ns for row in found.rows) == sorted(row.end_ns for row in expected.rows)
+    assert {(row.bus, row.frame) for row in found.rows} == {(row.bus, row.frame) for row in expected.rows}
+
+
+def judged(scenario: Scenario, hlc: HlcPart | None, gateway: GatewayPart | None, joints: JointsPart | None) -> Timing:
+    assert hlc is not None
+    return judge_timing(scenario.plan, hlc.time_zero, hlc.cycles.size, hlc, gateway, joints)
+
+
+def test_lock_step_run_has_no_late_cycle_and_lost_nothing(scenario: Scenario, parts: Parts) -> None:
+    """Neither simulated bus time nor a fault (frames changed and dropped) counts as lateness or loss."""
+    timing = judged(scenario, *parts)
+    assert timing.cycles == 100
+    assert timing.late == {}
+    assert timing.lost == []
+    assert timing.reasons(TimingLimits(0.0, 0)) == []
+
+
+def test_what_one_process_lost_is_named(scenario: Scenario, parts: Parts) -> None:
+    """Invalid when a frame was lost: queues, kernel, hub."""
+    hlc, gateway, joints = parts
+    losing = replace(gateway, service=Service(0, 0, Lateness(), {"dropped by vcan0 before they were read": 4}))
+    timing = judged(scenario, hlc, losing, joints)
+    assert timing.lost == ["gateway: 4 frames dropped by vcan0 before they were read"]
+    assert timing.counted == 4
+
+
+@pytest.mark.parametrize(
+    ("bus", "cob_id", "sent_by"),
+    [(0, 0x201, "controller"), (0, 0x181, "gateway"), (1, 0x201, "gateway"), (1, 0x186, "joints")],
+)
+@pytest.mark.parametrize("change", ["lost", "doubled", "swapped"])
+def test_frame_that_does_not_travel_as_it_was_sent_is_found(
+    scenario: Scenario, parts: Parts, bus: int, cob_id: int, sent_by: str, change: str
+) -> None:
+    """Loss, repetition and a wrong order between two of our processes, on either bus, either way."""
+    hlc, gateway, joints = parts
+    rows = {"gateway": gateway.rows, "controller": hlc.rows, "joints": joints.rows}
+    receiver = "gateway" if sent_by != "gateway" else ("controller" if bus == 0 else "joints")
+    index = bus if receiver == "gateway" else 0
+    changed = list(rows[receiver])
+    places = [
+        at
+        for at, row in enumerate(changed)
+        if row.bus == index and row.frame.can_id == cob_id and row.sender < 0 and row.end_ns > hlc.time_zero
+    ]
+    first, second = places[50], places[51]
+    assert changed[first].frame != changed[second].frame
+    if change == "lost":
+        del changed[first]
+    elif change == "doubled":
+        changed.insert(first, changed[first])
+    else:
+        changed[first], changed[second] = changed[second], changed[first]
+    if receiver == "gateway":
+        gateway = replace(gateway, rows=changed)
+    elif receiver == "controller":
+        hlc = replace(hlc, rows=changed)
+    else:
+        joints = replace(joints, rows=changed)
+    (problem,) = judged(scenario, hlc, gateway, joints).lost
+    assert f"frames from {sent_by} to {receiver} were lost, doubled or out of order: {cob_id:03X} (" in problem
+
+
+def test_frames_before_the_receiver_listened_and_after_it_left_are_not_lost(scenario: Scenario, parts: Parts) -> None:
+    """Processes start and end one after the other."""
+    hlc, gateway, joints = parts
+    zero = hlc.time_zero
+    rows = [row for row in gateway.rows if row.sender >= 0 or zero - 5 * MS < row.end_ns < zero + 900 * MS]
+    assert len(rows) < len(gateway.rows) - 200
+    assert judged(scenario, hlc, replace(gateway, rows=rows), joints).lost == []
+
+
+# --- lateness --------------------------------------------------------------------------------------------------------
+
+
+def delayed(rows: list[Transmission], start_ns: int, end_ns: int, by_ns: int, sent: bool | None) -> list[Transmission]:
+    """Rows of a span moved later; sent: own ones only, or received ones only, None for both."""
+    return [
+        Transmission(
+            row.end_ns + (by_ns if start_ns <= row.end_ns < end_ns and sent in (None, row.sender >= 0) else 0),
+            row.bus,
+            row.frame,
+            row.sender,
+        )
+        for row in rows
+    ]
+
+
+CYCLE = 10 * MS
+
+
+@pytest.mark.parametrize(
+    ("by_ns", "late"),
+    [(0, 0), (3 * MS, 0), (8 * MS, 0), (13 * MS, 1), (23 * MS, 1)],
+    ids=["not at all", "within the cycle", "still before the next SYNC", "after it", "more than 20 ms"],
+)
+def test_commands_late_by_more_than_the_cycle_has_left_make_it_late(
+    scenario: Scenario, parts: Parts, by_ns: int, late: int
+) -> None:
+    """A cycle is late when the controller's commands miss the next SYNC (sent 1 ms after theirs, 100 Hz)."""
+    hlc, gateway, joints = parts
+    start = hlc.time_zero + 40 * CYCLE
+    rows = [
+        row if not (row.sender >= 0 and row.frame.can_id > 0x200) else moved
+        for row, moved in zip(hlc.rows, delayed(hlc.rows, start, start + CYCLE, by_ns, sent=True), strict=True)
+    ]
+    timing = judged(scenario, replace(hlc, rows=rows), gateway, joints)
+    assert list(timing.late) == [40] * late
+    if late:
+        assert timing.worst.startswith("cycle 40, controller sent 2")
+        assert by_ns - 9 * MS < timing.late_worst_ns < by_ns - 7 * MS
+
+
+@pytest.mark.parametrize("who", ["controller", "joints", "gateway"])
+def test_process_that_stands_still_for_three_cycles_makes_them_late(
+    scenario: Scenario, parts: Parts, who: str
+) -> None:
+    """Whoever stands still: what it sends in that time goes out at its end, 30 ms late at most."""
+    hlc, gateway, joints = parts
+    start = hlc.time_zero + 40 * CYCLE
+    end = start + 3 * CYCLE
+
+    def stopped(rows: list[Transmission]) -> list[Transmission]:
+        return [
+            Transmission(end, row.bus, row.frame, row.sender)
+            if row.sender >= 0 and start <= row.end_ns < end
+            else row
+            for row in rows
+        ]
+
+    if who == "controller":
+        timing = judged(scenario, replace(hlc, rows=stopped(hlc.rows)), gateway, joints)
+    elif who == "joints":
+        timing = judged(scenario, hlc, gateway, replace(joints, rows=stopped(joints.rows)))
+    else:
+        timing = judged(scenario, hlc, replace(gateway, rows=stopped(gateway.rows)), joints)
+    assert set(timing.late) >= {40, 41}
+    assert set(timing.late) <= {40, 41, 42}
+    # cycle 40: its next SYNC was due one cycle after its own, and came to the joints one frame time later
+    assert timing.late_worst_ns == pytest.approx(2 * CYCLE, abs=MS // 5)
+    assert who in timing.worst
+
+
+@pytest.mark.parametrize("direction", ["to the gateway", "to the joints"])
+def test_bus_that_delays_frames_makes_their_cycles_late(scenario: Scenario, parts: Parts, direction: str) -> None:
+    """A hub that stands still: the processes were on time, what they sent arrives after the next SYNC."""
+    hlc, gateway, joints = parts
+    start = hlc.time_zero + 40 * CYCLE + MS // 2  # behind the SYNC
+    end = start + CYCLE // 2
+    if direction == "to the gateway":
+        moved = [
+            new if old.bus == CONTROLLER_BUS else old
+            for old, new in zip(gateway.rows, delayed(gateway.rows, start, end, 15 * MS, sent=False), strict=True)
+        ]
+        timing = judged(scenario, hlc, replace(gateway, rows=moved), joints)
+    else:
+        moved = delayed(joints.rows, start, end, 15 * MS, sent=False)
+        timing = judged(scenario, hlc, gateway, replace(joints, rows=moved))
+    assert list(timing.late) == [40]
+    assert "bus carried" in timing.worst
+
+
+@pytest.mark.parametrize(
+    ("late", "reasons"),
+    [
+        ({}, 0),
+        ({7: MS}, 0),  # 1 of 100 is 1 %: allowed
+        ({7: MS, 8: MS}, 1),
+        ({7: 20 * MS}, 0),
+        ({7: 20 * MS + 1}, 1),
+        ({7: 21 * MS, 8: MS}, 2),
+    ],
+)
+def test_limits_are_one_percent_of_cycles_and_20_ms(late: dict[int, int], reasons: int) -> None:
+    """Invalid when more than 1 % of the cycles are late, or one is late by more than 20 ms."""
+    timing = Timing(100, late, "cycle 7, joints sent 181", [], {})
+    assert len(timing.reasons(TimingLimits(0.01, 20 * MS))) == reasons
+
+
+def test_lost_frame_makes_a_run_invalid_however_punctual() -> None:
+    """Invalid when a frame was lost."""
+    assert Timing(100, {}, "", ["drive bus: ..."], {}).reasons(TimingLimits(1.0, 1 << 60)) == ["drive bus: ..."]
+
+
+# --- foreign software ------------------------------------------------------------------------------------------------
+
+
+def test_truth_of_foreign_drives_comes_from_their_frames(scenario: Scenario, expected: RunRecord, parts: Parts) -> None:
+    """Without our plant the metrics come from frames (source: bus), before any fault acts on them."""
+    hlc, gateway, _ = parts
+    found = merge(scenario.plan, expected.duration_ns, hlc, gateway, None, [])
+    assert found.source == "bus"
+    assert np.array_equal(found.truth.t_s, expected.truth.t_s)
+    inner = slice(20, -20)  # the ends have no frame on one side
+    error = np.abs(found.truth.q - expected.truth.q)[inner]
+    # a straight line between samples 10 ms apart is off by curvature * h^2 / 8; the stamp of SYNC on the drive bus lies
+    # up to two frame times (0.2 ms) behind the step that was latched; and the encoder has its resolution
+    curvature = np.abs(np.diff(expected.truth.dq, axis=0)).max() * 1000
+    speed = np.abs(expected.truth.dq).max()
+    assert error.max() < curvature * 0.01**2 / 8 + speed * 0.0002 + 2 * np.pi / 131072
+    assert error.max() > 0
+    # TPDO2 comes every tenth SYNC only: the torque is some value of the last 0.1 s
+    assert np.abs(found.truth.tau).max() <= np.abs(expected.truth.tau).max() * 1.05
+
+
+def test_drive_that_never_spoke_is_named(scenario: Scenario, expected: RunRecord, parts: Parts) -> None:
+    """Nothing stands for values that are not there."""
+    hlc, gateway, _ = parts
+    rows = [row for row in gateway.rows if row.frame.can_id != 0x186]
+    with pytest.raises(IncompleteError, match="right_ankle sent no TPDO1"):
+        merge(scenario.plan, expected.duration_ns, hlc, replace(gateway, rows=rows), None, [])
+
+
+def test_commands_of_a_foreign_controller_come_from_its_frames(
+    scenario: Scenario, expected: RunRecord, parts: Parts
+) -> None:
+    """Its torques as sent, before any fault; what it follows is not known."""
+    _, gateway, joints = parts
+    found = merge(scenario.plan, expected.duration_ns, None, gateway, joints, [])
+    assert not found.commands.has_reference
+    assert found.time0_ns == expected.time0_ns
+    assert np.array_equal(found.commands.t_s, expected.commands.t_s[: found.commands.t_s.size])
+    rated = np.array([scenario.plan.scale(joint, "N m") for joint in scenario.plan.joints])
+    wanted = np.clip(expected.commands.tau_command, -1000 * rated, 1000 * rated)  # the clamp is at rated torque
+    assert np.all(np.abs(found.commands.tau_command - wanted) <= rated)  # per mille of rated torque on the wire
+    assert np.array_equal(found.truth.q, expected.truth.q)
+
+
+def test_without_gateway_the_supervisors_ears_count(scenario: Scenario, expected: RunRecord, parts: Parts) -> None:
+    """A foreign gateway leaves no part: the supervisor has heard both buses."""
+    hlc, _, joints = parts
+    heard = [Transmission(row.end_ns, row.bus, row.frame, -1) for row in expected.rows]
+    found = merge(scenario.plan, expected.duration_ns, hlc, None, joints, heard)
+    assert [bus.frames for bus in found.buses] == [bus.frames for bus in expected.buses]
+    assert found.activations == []
+    foreign = merge(scenario.plan, expected.duration_ns, None, None, joints, heard)
+    assert foreign.time0_ns == hlc.time_zero  # on the grid of the plant
+
+
+def test_motion_that_never_began_is_told_with_its_reasons(scenario: Scenario, parts: Parts) -> None:
+    """The controller's own words."""
+    hlc, gateway, joints = parts
+    events = [NotedEvent(1, "left_hip", "start_failed", "no boot-up message")]
+    with pytest.raises(IncompleteError, match="never began: left_hip: no boot-up message"):
+        merge(scenario.plan, 1000 * MS, replace(hlc, time_zero=NEVER, events=events), gateway, joints, [])
+    with pytest.raises(IncompleteError, match="never began: no status frame"):
+        merge(scenario.plan, 1000 * MS, None, replace(gateway, time_zero=NEVER), joints, [])
+
+
+def test_plant_that_ended_before_the_motion_is_no_truth(scenario: Scenario, expected: RunRecord, parts: Parts) -> None:
+    """Golden and faulted run are compared instant by instant: none may be missing."""
+    hlc, gateway, joints = parts
+    q, dq, tau = (one[:-500] for one in (joints.q, joints.dq, joints.tau))
+    short = replace(joints, times_ns=joints.times_ns[:-500], q=q, dq=dq, tau=tau)
+    with pytest.raises(IncompleteError, match="ended before the motion did"):
+        merge(scenario.plan, expected.duration_ns, hlc, gateway, short, [])
+
+
+def test_live_control_is_an_event_of_the_result(scenario: Scenario, expected: RunRecord, parts: Parts) -> None:
+    """Each call is a row, refused ones with their reason."""
+    hlc, gateway, joints = parts
+    controls = [
+        ControlNote(hlc.time_zero + 500 * MS, "trigger", "bias", "socket", ""),
+        ControlNote(hlc.time_zero + 600 * MS, "arm", "x", "bus 0x6c0", "no such injector"),
+    ]
+    found = merge(scenario.plan, expected.duration_ns, hlc, replace(gateway, controls=controls), joints, [])
+    assert [(note.time_s, note.node, note.text) for note in found.notes if note.kind == "control"] == [
+        (0.5, "gateway", "trigger bias, by socket"),
+        (0.6, "gateway", "arm x, by bus 0x6c0: no such injector"),
+    ]

@@ -1,0 +1,257 @@
+"""Processes of a rig: their command line, what they say when they cannot run, how they take signals.
+
+Real processes against the clock are in test_supervisor.py and test_realtime.py.
+"""
+
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import ClassVar
+
+import pytest
+
+from canopen_exo.bus.channel import Arrival, Channel
+from canopen_exo.bus.frame import Frame
+from canopen_exo.bus.node import MS, NEVER, Node
+from fi_gateway.control import NAMED, WORDS
+from fi_gateway.control_socket import DEFAULT_ADDRESS
+from fi_gateway.gateway import CONTROLLER_PORT, DRIVE_PORT
+from testbench import cli_rig, process, supervisor
+from testbench.cli import main
+from testbench.errors import BenchError
+from testbench.gateway_process import ControlFrames, GatewayOptions, control_frames, gateway_main
+from testbench.parts import read_gateway, read_hlc, read_joints
+from testbench.process import Orders, ProcessOptions, die_with, hlc_main, joints_main, session
+from testbench.scenario import Scenario, parse_scenario
+
+
+@pytest.fixture
+def scenario() -> Scenario:
+    return parse_scenario(cli_rig.DEFAULT_SCENARIO)
+
+
+class DeadChannel(Channel):
+    """An interface on which nothing comes but what is there already, and that takes everything; nothing to wait on."""
+
+    there_already: ClassVar[list[Arrival]] = []
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name)
+        self.poll_at = 0
+        self.sent: list[Frame] = []
+        self.closed = False
+
+    def fileno(self) -> int:
+        return -1
+
+    def receive(self) -> list[Arrival]:
+        first = self.poll_at == 0
+        self.poll_at = NEVER
+        return self.there_already if first else []
+
+    def send(self, frame: Frame) -> bool:
+        self.sent.append(frame)
+        return True
+
+    def close(self) -> None:
+        self.closed = True
+
+
+@pytest.fixture
+def channels(monkeypatch: pytest.MonkeyPatch) -> list[DeadChannel]:
+    """Every interface that is opened is one of these."""
+    opened: list[DeadChannel] = []
+
+    def open_dead(name: str) -> Channel:
+        opened.append(DeadChannel(name))
+        return opened[-1]
+
+    monkeypatch.setattr(process, "open_bus", open_dead)
+    return opened
+
+
+@pytest.fixture
+def signalled(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
+    """Signals that each process finds as soon as it begins, in place of somebody who sends them."""
+    numbers: list[int] = []
+    before = Orders.__init__
+
+    def begin(orders: Orders) -> None:
+        before(orders)
+        for number in numbers:
+            orders.note(number, None)
+
+    monkeypatch.setattr(Orders, "__init__", begin)
+    return iter([numbers])
+
+
+# --- told to end -----------------------------------------------------------------------------------------------------
+
+
+def test_joints_told_to_end_leave_their_part(
+    scenario: Scenario, channels: list[DeadChannel], signalled: Iterator[list[int]], tmp_path: Path
+) -> None:
+    """SIGTERM ends a process in order, part and all, and its interface is closed."""
+    next(signalled).append(signal.SIGTERM)
+    part = tmp_path / "joints.npz"
+    assert joints_main(scenario, "hub:drive", ProcessOptions(part=part)) == 0
+    assert read_joints(part).q.shape[1] == 6
+    assert [(channel.name, channel.closed) for channel in channels] == [("hub:drive", True)]
+
+
+def test_controller_told_to_end_before_it_began_leaves_at_once(
+    scenario: Scenario, channels: list[DeadChannel], signalled: Iterator[list[int]], tmp_path: Path
+) -> None:
+    """Asked for, so no failure: exit 0."""
+    next(signalled).append(signal.SIGTERM)
+    part = tmp_path / "hlc.npz"
+    assert hlc_main(scenario, "hub:controller", ProcessOptions(part=part), endless=True) == 0
+    assert not read_hlc(part).completed
+
+
+def test_controller_without_drives_gives_up_and_says_why(
+    scenario: Scenario, channels: list[DeadChannel], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Exit 1: no boot-up message within 1 s; nothing hangs."""
+    part = tmp_path / "hlc.npz"
+    assert hlc_main(scenario, "hub:controller", ProcessOptions(part=part), endless=False) == 1
+    (event,) = read_hlc(part).events
+    assert "no boot-up message" in event.text
+    assert event.text in capfd.readouterr().err
+    assert channels[0].sent[0] == Frame(0x77F, b"\x00")
+
+
+def test_frame_that_is_there_before_the_controller_begins_does_not_keep_it_from_beginning(
+    scenario: Scenario, channels: list[DeadChannel], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A bus is never silent when a process joins it: here the late answer to somebody's SDO request."""
+    answer = Arrival(0, Frame(0x581, bytes.fromhex("4300100092010200")), None)
+    monkeypatch.setattr(DeadChannel, "there_already", [answer])
+    assert hlc_main(scenario, "hub:controller", ProcessOptions(), endless=False) == 1
+    assert Frame(0x77F, b"\x00") in channels[0].sent  # and gave up for want of drives
+
+
+def test_gateway_first_stops_injecting_and_ends_with_the_second_interrupt(
+    scenario: Scenario, channels: list[DeadChannel], signalled: Iterator[list[int]], tmp_path: Path
+) -> None:
+    """SIGINT first stops injecting, then passes frames until told again; live control has a row of it."""
+    next(signalled).extend([signal.SIGINT, signal.SIGINT])
+    part = tmp_path / "gateway.npz"
+    options = ProcessOptions(part=part)
+    assert gateway_main(scenario, ("hub:controller", "hub:drive"), options, GatewayOptions()) == 0
+    (row,) = read_gateway(part).controls
+    assert (row.what, row.name, row.source, row.refused) == ("stop", "", "signal", "")
+    assert [channel.name for channel in channels] == ["hub:controller", "hub:drive"]
+
+
+def test_signal_handlers_of_the_caller_are_put_back() -> None:
+    """A library call leaves the process as it was."""
+    before = signal.getsignal(signal.SIGTERM)
+    with Orders().taken() as orders:
+        signal.raise_signal(signal.SIGTERM)
+        signal.raise_signal(signal.SIGINT)
+        assert (orders.terminations, orders.interrupts, orders.count) == (1, 1, 2)
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_process_whose_supervisor_is_gone_does_not_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing is left over when the supervisor dies between start and now."""
+    monkeypatch.setattr(sys, "platform", "other")  # pytest itself is not to end with its parent
+    with pytest.raises(BenchError, match=r"supervisor .* is gone"):
+        die_with(2**22 + 1)
+
+
+def test_process_ends_when_its_supervisor_is_gone(
+    channels: list[DeadChannel], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where the kernel does not tell, the process looks by itself."""
+    monkeypatch.setattr(process, "die_with", lambda supervisor: None)
+    with session("joints", Node(), ["hub:drive"], [0], ProcessOptions(supervisor=2**22 + 1)) as served:
+        served.run(lambda now: False)
+
+
+def test_nodes_begin_on_the_next_whole_millisecond(channels: list[DeadChannel]) -> None:
+    """All processes share one epoch, so that the grids of physics and SYNC agree."""
+    with session("joints", Node(), ["hub:drive"], [0], ProcessOptions(epoch_ns=1)) as served:
+        assert served.start_ns % MS == 0
+        assert 0 < served.start_ns - served.loop.now() + MS <= 2 * MS or served.start_ns <= served.loop.now()
+        assert served.loop.epoch_ns == 1
+
+
+# --- command line ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["run", "x.yaml", "--without", "hlc"], "--realtime"),
+        (["up", "--controller-bus", "hub:a"], "--drive-bus"),
+        (["up", "--drive-bus", "hub:a"], "--controller-bus"),
+        (["up", "--controller-bus", "hub:a", "--drive-bus", "hub:a"], "round for ever"),
+        (["gateway", "--controller-bus", "hub:a", "--drive-bus", "hub:a"], "round for ever"),
+        (["gateway", "--control-frames", "middle"], "controller or drive"),
+        (["joints", "--bus", "nonsense"], "INTERFACE:CHANNEL"),
+        (["hlc", "--bus", "hub:127.0.0.1:1/x"], "exo-hil hub"),
+        (["joints", "--set", "rig.rate=3 Hz"], "allowed: 500, 250"),
+        (["hlc", "missing.yaml"], "missing.yaml"),
+        (["fault", "list", "--at", "127.0.0.1:1"], "is a gateway running"),
+    ],
+)
+def test_wrong_command_line_is_told_in_one_line(
+    arguments: list[str],
+    words: str,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Exit 2 for usage; what is wrong, and what to do. Without SocketCAN rights: one line saying what to run."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "x.yaml").write_text(cli_rig.DEFAULT_SCENARIO)
+    assert main(arguments) == 2
+    said = capsys.readouterr().err
+    assert words in said
+    assert len(said.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "wanted"),
+    [
+        ("controller", ControlFrames(CONTROLLER_PORT)),
+        ("drive", ControlFrames(DRIVE_PORT)),
+        ("drive:0x6C2,1731", ControlFrames(DRIVE_PORT, 0x6C2, 0x6C3)),
+    ],
+)
+def test_control_frames_are_named_by_side_and_ids(text: str, wanted: ControlFrames) -> None:
+    """Off by default, COB-IDs configurable."""
+    assert control_frames(text) == wanted
+
+
+@pytest.mark.parametrize("text", ["", "drive:", "drive:1", "drive:1,2,3", "drive:a,b", "1"])
+def test_wrong_control_frames_are_refused(text: str) -> None:
+    """With the form that is allowed."""
+    with pytest.raises(BenchError, match="drive:0x6C0,0x6C1"):
+        control_frames(text)
+
+
+def test_command_line_has_the_words_and_the_address_of_live_control() -> None:
+    """They are written again in the command line, so that its help imports nothing."""
+    assert cli_rig.NAMED == NAMED
+    assert set(cli_rig.NAMED + cli_rig.UNNAMED) == set(WORDS)
+    assert cli_rig.CONTROL_ADDRESS == DEFAULT_ADDRESS
+    assert cli_rig.PARTS == supervisor.PARTS
+
+
+def test_gateway_and_hub_need_neither_mujoco_nor_the_controller() -> None:
+    """Design: `exo-hil gateway` and `exo-hil hub` work without the extra `sim`."""
+    code = (
+        "import sys\n"
+        "import testbench.gateway_process, testbench.cli_rig, canopen_exo.bus.hub\n"
+        "from testbench.parts import write_gateway\n"
+        "from testbench.scenario import parse_scenario\n"
+        "parse_scenario(testbench.cli_rig.DEFAULT_SCENARIO)\n"
+        "sys.exit(' '.join({'mujoco', 'pyarrow', 'matplotlib', 'hlc.node', 'can'} & set(sys.modules)) or 0)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
