@@ -73,8 +73,12 @@ KINDS: Final = (
           "error_state_indicator": True, "data": _fd(64)}),
 )
 
-RAW_DLC: Final = tuple(Frame(0x100 + dlc, EIGHT, 0, dlc) for dlc in range(9, 16))
-"""Classical frames of 8 bytes whose DLC on the wire is above 8; python-can and these can-utils do not know them."""
+RAW_DLC: Final = (
+    *(Frame(0x100 + dlc, EIGHT, 0, dlc) for dlc in range(9, 16)),
+    Frame(0x1ABCDEF0, EIGHT, FLAG_EXTENDED, 12),
+    Frame(0x7F, b"", FLAG_REMOTE, 15),
+)
+"""Classical frames whose DLC on the wire is above 8; python-can and can-utils of 2020 do not know them."""
 
 BUS_OFF: Final = (0x040, bytes(8))
 PASSIVE: Final = (0x004, bytes((0, 0x20, 0, 0, 0, 0, 0, 0)))

@@ -69,7 +69,7 @@ def test_every_kind_of_frame_is_sent_as_it_was_given(either: Channel, peer: can.
     assert either.lost == 0
 
 
-@pytest.mark.parametrize("frame", RAW_DLC, ids=lambda frame: f"dlc-{frame.dlc}")
+@pytest.mark.parametrize("frame", RAW_DLC, ids=lambda frame: f"{frame.can_id:X}-dlc-{frame.dlc}")
 def test_raw_dlc_above_8_passes_the_kernel(opened: Callable[[str], Channel], frame: Frame) -> None:
     """len8_dlc: a classical frame of 8 bytes may say 9..15 on the wire (ISO 11898-1)."""
     sender, receiver = opened("socketcan:vcan0"), opened("socketcan:vcan0")

@@ -8,6 +8,7 @@ not hang on time (nothing lost, order, orderly end) is asserted even then.
 import json
 import shutil
 import signal
+import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -40,6 +41,7 @@ pytestmark = pytest.mark.realtime
 
 BUSES: Final = ("socketcan:vcan0", "socketcan:vcan1")
 TRIES: Final = 3
+PATIENCE_S: Final = 80.0
 
 CYCLE_NS: Final = 20 * MS
 CYCLES: Final = 125
@@ -97,10 +99,14 @@ T = TypeVar("T")
 
 @final
 class Patience:
-    """How often a run that was late may be tried again: twice; when that did not help, no other test tries again."""
+    """How often a run that was late may be tried again: twice; when that did not help, no other test tries again.
+
+    Nor does any when all of them together have taken long already.
+    """
 
     def __init__(self) -> None:
         self._tries = TRIES
+        self._until = time.monotonic() + PATIENCE_S
 
     def until_punctual(self, attempt: Callable[[], T | Late]) -> T:
         """What an attempt gives that is not late; skips when all were."""
@@ -110,6 +116,8 @@ class Patience:
             if not isinstance(got, Late):
                 return got
             told.append(got.why)
+            if time.monotonic() > self._until:
+                break
         self._tries = 1
         pytest.skip("this machine is too busy for real time: " + "; again: ".join(told))
 
