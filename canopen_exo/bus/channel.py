@@ -15,6 +15,10 @@ from mypy_extensions import mypyc_attr
 from canopen_exo.bus.frame import Frame
 from canopen_exo.bus.node import NEVER, PortState
 
+_COMPARISONS: Final = 3
+_COMPARED_WITHIN_NS: Final = 200_000
+"""A process that is interrupted between two clocks compares them again, twice at most."""
+
 
 @final
 class Arrival:
@@ -82,8 +86,17 @@ class StampClock:
 
     def begin(self, epoch_ns: int) -> int:
         """Compare the clocks; returns now on the loop's clock [ns]."""
-        self._now = time.monotonic_ns() - epoch_ns
-        self._offset = time.time_ns() - self._now
+        tightest = NEVER
+        for _ in range(_COMPARISONS):
+            before = time.monotonic_ns()
+            wall = time.time_ns()
+            after = time.monotonic_ns()
+            if after - before < tightest:
+                tightest = after - before
+                self._offset = wall - (before + after) // 2 + epoch_ns
+            if tightest < _COMPARED_WITHIN_NS:
+                break
+        self._now = after - epoch_ns
         return self._now
 
     def at(self, realtime_ns: int) -> int:

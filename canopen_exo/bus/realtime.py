@@ -138,19 +138,20 @@ class RealTimeOut(Out):
     def _try(self, line: _Line, port: int, frame: Frame, handled_ns: int) -> bool:
         channel = line.channel
         lost = channel.lost
+        shared = len(line.ports) > 1
+        now = 0
+        if shared or self._trace is not None:  # before the call: afterwards the frame may have arrived long ago
+            now = self._clock() - self._epoch_ns
         if not channel.send(frame):
             return False
         if channel.lost != lost:
             return True
-        shared = len(line.ports) > 1
-        if shared or self._measure or self._trace is not None:
-            now = self._clock() - self._epoch_ns
-            if self._trace is not None:
-                self._trace.append(Transmission(now, line.index, frame, port))
-            if self._measure and handled_ns != NEVER:
-                line.latency.add(now - handled_ns)
-            if shared:
-                self.echoes.append(_Echo(now, line.ports[1] if line.ports[0] == port else line.ports[0], frame))
+        if self._trace is not None:
+            self._trace.append(Transmission(now, line.index, frame, port))
+        if self._measure and handled_ns != NEVER:
+            line.latency.add(self._clock() - self._epoch_ns - handled_ns)
+        if shared:
+            self.echoes.append(_Echo(now, line.ports[1] if line.ports[0] == port else line.ports[0], frame))
         return True
 
 
