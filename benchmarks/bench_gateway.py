@@ -106,6 +106,7 @@ def serve_gateway(ends: list[str]) -> None:
         stopped = True
 
     signal.signal(signal.SIGTERM, stop)
+    # mypy cannot infer a lambda whose default argument binds the loop variable
     channels = [SocketCanChannel(f"socketcan:{end}", lambda end=end: near_socket(end)) for end in ends]  # type: ignore[misc]
     epoch_ns = time.monotonic_ns()
     for channel in channels:

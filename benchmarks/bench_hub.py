@@ -72,6 +72,7 @@ def remote_server(pipe: Connection, _: int) -> None:
     """python-can-remote's server in front of python-can's virtual bus."""
     from threading import Thread
 
+    # the package ships no types
     from can_remote.server import RemoteServer  # type: ignore[import-untyped]
 
     server = RemoteServer("127.0.0.1", 0, interface="virtual", channel="bench")
@@ -103,11 +104,13 @@ class Recorder:
 def ready_made(bus: can.BusABC, interface: str, frames: int) -> tuple[socket.socket, bytes]:
     """The bus's socket, set to block, and the bytes of `frames` numbered messages as its own client makes them."""
     if interface == "hub":
+        # the raw link under the python-can class: reached into on purpose, to time forwarding alone
         link = socket.socket(fileno=os.dup(bus._link.fileno()))  # type: ignore[attr-defined]
         link.setblocking(True)
         return link, b"".join(
             pack_frame(Frame(0x181, number.to_bytes(8, "little"))) for number in range(frames)
         )
+    # as above, for the other side of the comparison
     websocket = bus.remote_protocol._ws  # type: ignore[attr-defined]
     link, recorder = websocket.socket, Recorder()
     websocket.socket = recorder
