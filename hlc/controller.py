@@ -176,21 +176,21 @@ class Controller:
             )
         while primitive.cycle < cycle:
             dmp.step(primitive)
-        q_d, dq_d, ddq_d = list(primitive.y), [0.0] * self.n_joints, [0.0] * self.n_joints
+        q_d = list(primitive.y)
         per_tau = 1.0 / dmp.tau_s
-        for j in range(self.n_joints):
-            dq_d[j] = primitive.z[j] * per_tau
-        if cycle >= self.time_zero_cycle:
-            dmp.ahead(primitive, self._q_then, self._dq_then, ddq_d)
-        else:
+        dq_d: list[float] = []
+        for rate in primitive.z:
+            dq_d.append(rate * per_tau)
+        ddq_d = dmp.acceleration_ahead(primitive)
+        if cycle < self.time_zero_cycle:
             self._fade(cycle, q_d, dq_d, ddq_d)
         state.q_d, state.dq_d, state.ddq_d = q_d, dq_d, ddq_d
 
     def _fade(self, cycle: int, q_d: list[float], dq_d: list[float], ddq_d: list[float]) -> None:
-        """Turn q(t) at `cycle` into s(t) q(t), and write the acceleration of the latter `ahead_ns` later."""
+        """Turn q(t) at `cycle` into s(t) q(t), and its acceleration `ahead_ns` later into that of the latter."""
         params = self.params
         q_then, dq_then = self._q_then, self._dq_then
-        self.dmp.ahead(self.state.dmp, q_then, dq_then, ddq_d)
+        self.dmp.ahead(self.state.dmp, q_then, dq_then)
         now_ns = cycle * params.cycle_ns
         s, ds, _ = fade_in(now_ns, params.stride_ns)
         s_then, ds_then, dds_then = fade_in(now_ns + params.ahead_ns, params.stride_ns)

@@ -36,6 +36,9 @@ Array = NDArray[np.float64]
 ALPHA_Z: Final = 25.0
 """Gain of the transformation system: the value customary in the literature, the paper gives none."""
 
+BETA_Z: Final = ALPHA_Z / 4
+"""Critical damping (the paper's equations)."""
+
 BASIS_FUNCTIONS: Final = 25
 """With WIDTH they reproduce seven harmonics to below 1e-7 rad."""
 
@@ -103,7 +106,13 @@ class RhythmicDmp:
         y, z = _forced(phase, self.weights, self.tau_s, ahead_s)
         self._ahead_y: Final[list[list[float]]] = y.tolist()
         self._ahead_z: Final[list[list[float]]] = z.tolist()
-        self._ahead_f: Final[list[list[float]]] = (basis(phase + ahead_s / self.tau_s) @ self.weights).tolist()
+        # tau^2 y'' = f - alpha_z (beta_z (y - g) + z), with y and z as they are `ahead_ns` later
+        per_tau2 = 1.0 / self.tau_s**2
+        force = basis(phase + ahead_s / self.tau_s) @ self.weights
+        self._ahead_f: Final[list[list[float]]] = ((force - ALPHA_Z * (BETA_Z * y + z)) * per_tau2).tolist()
+        yy, yz, zy, zz = _transition(self.tau_s, ahead_s)
+        self._ahead_ay: Final[float] = -ALPHA_Z * (BETA_Z * yy + zy) * per_tau2
+        self._ahead_az: Final[float] = -ALPHA_Z * (BETA_Z * yz + zz) * per_tau2
 
     def __deepcopy__(self, memo: dict[int, object]) -> "RhythmicDmp":
         """Itself: nothing in it changes."""
@@ -134,22 +143,26 @@ class RhythmicDmp:
             z[j] = zy * gap + zz * rate + forced_z[j]
         state.cycle += 1
 
-    def ahead(self, state: RhythmicState, q: list[float], dq: list[float], ddq: list[float]) -> None:
-        """Write angle, velocity and acceleration at `ahead_ns` after the state's cycle: rad, rad/s, rad/s^2."""
+    def ahead(self, state: RhythmicState, q: list[float], dq: list[float]) -> None:
+        """Write angle and velocity at `ahead_ns` after the state's cycle: rad, rad/s."""
         at = state.cycle % self.n_cycles
-        forced_y, forced_z, force = self._ahead_y[at], self._ahead_z[at], self._ahead_f[at]
+        forced_y, forced_z = self._ahead_y[at], self._ahead_z[at]
         yy, yz, zy, zz = self._ahead_yy, self._ahead_yz, self._ahead_zy, self._ahead_zz
         y, z, goal = state.y, state.z, state.goal
         per_tau = 1.0 / self.tau_s
-        per_tau2 = per_tau * per_tau
         for j in range(self.n_joints):
             gap = y[j] - goal[j]
-            rate = z[j]
-            gap_then = yy * gap + yz * rate + forced_y[j]
-            rate_then = zy * gap + zz * rate + forced_z[j]
-            q[j] = goal[j] + gap_then
-            dq[j] = rate_then * per_tau
-            ddq[j] = (force[j] - ALPHA_Z * (0.25 * ALPHA_Z * gap_then + rate_then)) * per_tau2
+            q[j] = goal[j] + yy * gap + yz * z[j] + forced_y[j]
+            dq[j] = (zy * gap + zz * z[j] + forced_z[j]) * per_tau
+
+    def acceleration_ahead(self, state: RhythmicState) -> list[float]:
+        """The acceleration at `ahead_ns` after the state's cycle: (n_joints,), rad/s^2."""
+        ay, az = self._ahead_ay, self._ahead_az
+        ddq: list[float] = []
+        y, z, goal, force = state.y, state.z, state.goal, self._ahead_f[state.cycle % self.n_cycles]
+        for j in range(self.n_joints):
+            ddq.append(force[j] + ay * (y[j] - goal[j]) + az * z[j])
+        return ddq
 
 
 def cycles_per_stride(stride_ns: int, cycle_ns: int) -> int:
@@ -175,7 +188,7 @@ def learn_weights(gait: Gait) -> Array:
     turns = np.arange(20 * BASIS_FUNCTIONS) / (20 * BASIS_FUNCTIONS)
     tau_s = gait.stride_ns * 1e-9 / (2 * math.pi)
     gap = gait.q(turns) - gait.mean()
-    target = tau_s**2 * gait.ddq(turns) + ALPHA_Z * (ALPHA_Z / 4 * gap + tau_s * gait.dq(turns))
+    target = tau_s**2 * gait.ddq(turns) + ALPHA_Z * (BETA_Z * gap + tau_s * gait.dq(turns))
     weights: Array = np.linalg.lstsq(basis(2 * np.pi * turns), target, rcond=None)[0].astype(np.float64)
     return weights
 

@@ -57,7 +57,10 @@ ENCODER: Final = EncoderParams(131072, 0, 1)
 
 def encode(q: float, params: EncoderParams) -> int:
     """Counts at the joint angle q [rad, finite]; clipped at int32 (16384 turns of a 17-bit encoder)."""
-    return to_int32(q * params.factor / TURN + params.offset)
+    value = q * params.factor / TURN + params.offset
+    if _LOWEST < value < _HIGHEST:
+        return floor(value + 0.5)
+    return to_int32(value)
 
 
 @dataclass(frozen=True, slots=True)

@@ -61,8 +61,8 @@ def _stuffing_of_bytes(state: int) -> list[tuple[int, int]]:
     return table
 
 
-def _stuffing_of_words() -> list[list[int]]:
-    """By state and 16 bits: number of stuff bits << 3 | the state that follows; below 40: small integers are shared."""
+def _stuffing_of_words() -> list[bytes]:
+    """By state and 16 bits: number of stuff bits << 3 | the state that follows, below 40."""
     of_byte = [_stuffing_of_bytes(state) for state in range(8)]
     parts = [[count << 3 | now for now, count in row] for row in of_byte]  # of the second byte
     moved = [[[entry + (count << 3) for entry in part] for part in parts] for count in range(3)]
@@ -71,14 +71,15 @@ def _stuffing_of_words() -> list[list[int]]:
         row: list[int] = []
         for now, count in of_byte[state]:
             row.extend(moved[count][now])
-        rows.append(row)
+        rows.append(bytes(row))
     return rows
 
 
 _CRC: Final[list[int]] = _crc_of_words()
-_STUFFING: Final[list[list[int]]] = _stuffing_of_words()
-_NEXT: Final[list[list[int]]] = [_STUFFING[entry & 7] for entry in range(40)]
-"""The row of the following state, by entry. Look-ups in lists are the cheapest thing CPython does with integers."""
+_STUFFING: Final[list[bytes]] = _stuffing_of_words()
+"""Half a megabyte, which a processor's second cache holds; as lists of references they would be eight times that."""
+_NEXT: Final[list[bytes]] = [_STUFFING[entry & 7] for entry in range(40)]
+"""The row of the following state, by entry."""
 _COUNT: Final[list[int]] = [entry >> 3 for entry in range(40)]
 """Stuff bits, by entry."""
 _LAST_COUNT: Final[list[int]] = [(entry >> 3) - (entry & 1) for entry in range(40)]
@@ -110,7 +111,7 @@ def crc15(header: int, data: bytes) -> int:
     return crc >> 1
 
 
-def _head(can_id: int, size: int) -> tuple[list[int], int, int]:
+def _head(can_id: int, size: int) -> tuple[bytes, int, int]:
     """After the 19 header bits of a base data frame: stuffing row, CRC register, length of the frame as known so far.
 
     The length lacks the stuff bits of data and CRC.
@@ -126,24 +127,23 @@ _HEADS: Final = [[_head(can_id, size) for can_id in range(0x800)] if size % 2 ==
 """By payload size (even) and id."""
 
 
-def frame_bits(can_id: int, data: bytes, extended: bool, remote: bool, dlc: int) -> int:
-    """Bits on the wire from SOF to the end of the 3-bit intermission, stuff bits included."""
+def base_frame_bits(can_id: int, data: bytes) -> int:
+    """Bits on the wire of a base data frame, from SOF to the end of the 3-bit intermission, stuff bits included."""
     size = len(data)
-    heads = _HEADS[size]
-    if extended or remote or dlc != size or not heads:
-        return _any_frame_bits(can_id, data, extended, remote, dlc)
-    row, crc, count = heads[can_id]
-    crcs = _CRC
+    if size & 1:
+        return frame_bits(can_id, data, False, False, size)
+    row, crc, bits = _HEADS[size][can_id]
+    crcs, counts, following = _CRC, _COUNT, _NEXT
     word: int
     for word in _WORDS[size](data):
         entry = row[word]
-        count += _COUNT[entry]
-        row = _NEXT[entry]
+        bits += counts[entry]
+        row = following[entry]
         crc = crcs[crc ^ word]
-    return count + _LAST_COUNT[row[crc]]
+    return bits + _LAST_COUNT[row[crc]]
 
 
-def _any_frame_bits(can_id: int, data: bytes, extended: bool, remote: bool, dlc: int) -> int:
+def frame_bits(can_id: int, data: bytes, extended: bool, remote: bool, dlc: int) -> int:
     """The same for every classical frame."""
     length = (39 if extended else 19) + 8 * len(data)
     whole = length >> 4 << 1  # bytes in whole words

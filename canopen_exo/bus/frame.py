@@ -5,7 +5,7 @@ Source: ISO 11898-1. Classical frames are complete; the FD flags are carried but
 
 from typing import Final, final
 
-from canopen_exo.bus.bits import frame_bits
+from canopen_exo.bus.bits import base_frame_bits, frame_bits
 from canopen_exo.errors import CanopenExoError
 
 FLAG_EXTENDED: Final = 1
@@ -55,8 +55,8 @@ class Frame:
     def measure(self) -> int:
         """Work out `bits`; once is enough, both hops of a gateway use it."""
         flags = self.flags
-        if flags == 0:
-            bits = frame_bits(self.can_id, self.data, False, False, self.dlc)
+        if flags == 0 and self.dlc == len(self.data):
+            bits = base_frame_bits(self.can_id, self.data)
         else:
             bits = frame_bits(self.can_id, self.data, flags & FLAG_EXTENDED != 0, flags & FLAG_REMOTE != 0, self.dlc)
         self.bits = bits

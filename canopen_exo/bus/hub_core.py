@@ -209,12 +209,13 @@ class TimedBus(SharedBus):
         super().join(client)
         medium = self.medium
         for port, seat in enumerate(self._seats):
-            on_the_wire = medium.end != NEVER and medium.sender == port
-            if seat is None and medium.ports[port].queued == 0 and not on_the_wire:
+            there = medium.ports[port]
+            on_the_wire = medium.end != NEVER and medium.on_wire[1] is there
+            if seat is None and there.queued == 0 and not on_the_wire:
                 client.port = port
                 self._seats[port] = client
                 return
-        client.port = medium.attach(Node())
+        client.port = medium.attach(Node()).number
         self._seats.append(client)
 
     def leave(self, client: Client) -> None:
@@ -245,7 +246,7 @@ class TimedBus(SharedBus):
         else:
             port = self.medium.ports[client.port]
             before = port.dropped
-            self.medium.queue(client.port, unpack_frame(data, at))
+            self.medium.queue(port, unpack_frame(data, at))
             if port.dropped != before:
                 self.overflows += 1
                 client.overflow += 1
@@ -263,11 +264,10 @@ class TimedBus(SharedBus):
         medium = self.medium
         while medium.end <= now:
             end = medium.end
-            frame = medium.frame
-            assert frame is not None
+            frame, sender = medium.on_wire
             medium.end = NEVER
             self.lateness.add(now - end)
-            self._deliver(end, frame, self._seats[medium.sender])
+            self._deliver(end, frame, self._seats[sender.number])
             if medium.waiting:
                 medium.arbitrate(end)
         self.wake_at = medium.end

@@ -7,7 +7,7 @@ buses arbitrate. No clock is read: the same nodes give the same trace on every m
 from typing import Final, final
 
 from canopen_exo.bus.frame import Frame
-from canopen_exo.bus.medium import Listener, Medium, Transmission
+from canopen_exo.bus.medium import QUEUE_LENGTH, Medium, Port, Transmission
 from canopen_exo.bus.node import NEVER, Node, Out
 from canopen_exo.errors import CanopenExoError
 
@@ -17,12 +17,18 @@ class MediumOut(Out):
     """The transmit side of a node: its ports by number."""
 
     def __init__(self) -> None:
-        self.media: list[Medium] = []
-        self.ports: list[int] = []
+        self.ports: Final[list[Port]] = []
 
     def send(self, port: int, frame: Frame) -> None:
         """Put `frame` into the transmit queue of the node's port."""
-        self.media[port].queue(self.ports[port], frame)
+        sender = self.ports[port]
+        waiting = sender.waiting
+        # in a burst the ids mostly rise, so the frame goes behind all others
+        contends = waiting and (waiting[-1][0].arbitration >= frame.arbitration or len(waiting) >= QUEUE_LENGTH)
+        if contends or frame.flags:
+            sender.medium.queue(sender, frame)
+        else:
+            waiting.append((frame, sender))
 
 
 @final
@@ -33,14 +39,24 @@ class Loop:
         self.media: Final[list[Medium]] = media
         self.nodes: list[Node] = []
         self.outs: list[MediumOut] = []
-        self.trace: list[Transmission] = []
         self.now: int = 0
+        self._ends: Final[list[int]] = []
+        self._passed: Final[list[tuple[Frame, Port]]] = []
+        self._rows: Final[list[Transmission]] = []
+
+    @property
+    def trace(self) -> list[Transmission]:
+        """Every frame that passed a bus so far, in loop order."""
+        rows = self._rows
+        for at in range(len(rows), len(self._ends)):
+            frame, sender = self._passed[at]
+            rows.append(Transmission(self._ends[at], sender.medium.index, frame, sender.number))
+        return rows
 
     def connect(self, node: Node, media: list[Medium]) -> None:
         """Add a node; its port k is attached to media[k]. Order of adding is the order of waking."""
         out = MediumOut()
         for medium in media:
-            out.media.append(medium)
             out.ports.append(medium.attach(node))
         self.nodes.append(node)
         self.outs.append(out)
@@ -49,23 +65,23 @@ class Loop:
 
     def _listen(self, medium: Medium) -> None:
         """Who hears each sender: every node once, on the first of its ports there that is not the sender."""
-        for number in range(len(medium.ports)):
-            listeners: list[Listener] = []
+        for sender in medium.ports:
+            listeners: list[tuple[Node, int, Out]] = []
             for node, out in zip(self.nodes, self.outs, strict=True):
                 for port in range(len(out.ports)):
-                    if out.media[port] is medium and out.ports[port] != number:
-                        listeners.append(Listener(node, port, out))
+                    if out.ports[port].medium is medium and out.ports[port] is not sender:
+                        listeners.append((node, port, out))
                         break
-            medium.ports[number].listeners = listeners
+            sender.listeners = listeners
 
     def run_until(self, until: int) -> None:
         """Serve every instant up to and including `until` [ns]."""
         if until < self.now:
             raise CanopenExoError(f"loop: run until {until} ns given, it is {self.now} ns; time does not go back")
         media = self.media
-        trace = self.trace
+        ends, passed = self._ends, self._passed
         for medium in media:  # queued between two calls, or the cable was mended
-            if medium.waiting and medium.on_wire is None:
+            if medium.waiting and medium.end == NEVER:
                 medium.arbitrate(self.now)
         wake = self._first_wake()
         if wake < self.now:
@@ -81,22 +97,20 @@ class Loop:
             if end == now:
                 for medium in media:
                     if medium.end == now:
-                        row = medium.on_wire
-                        assert row is not None
-                        medium.on_wire = None
                         medium.end = NEVER
-                        trace.append(row)
-                        frame = row.frame
-                        for listener in medium.ports[row.sender].listeners:
-                            node = listener.node
-                            node.receive(now, listener.port, frame, listener.out)
+                        row = medium.on_wire
+                        ends.append(now)
+                        passed.append(row)
+                        frame, sender = row
+                        for node, port, out in sender.listeners:
+                            node.receive(now, port, frame, out)
                             if node.wake_at < wake:
                                 wake = node.wake_at
             if wake <= now:
                 wake = self._wake(now)
             end = NEVER
             for medium in media:
-                if medium.on_wire is None:
+                if medium.end == NEVER:
                     if not medium.waiting:
                         continue
                     medium.arbitrate(now)

@@ -8,7 +8,16 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from hlc.dmp import ALPHA_Z, BASIS_FUNCTIONS, MAX_CYCLES, RhythmicDmp, RhythmicState, basis, cycles_per_stride
+from hlc.dmp import (
+    ALPHA_Z,
+    BASIS_FUNCTIONS,
+    BETA_Z,
+    MAX_CYCLES,
+    RhythmicDmp,
+    RhythmicState,
+    basis,
+    cycles_per_stride,
+)
 from hlc.errors import HlcError
 from hlc.gait import Gait, packaged_recording
 
@@ -46,12 +55,10 @@ def test_primitive_reproduces_the_gait(gait: Gait, cycle_ns: int) -> None:
     dmp = RhythmicDmp(gait, cycle_ns, 0)
     state = dmp.start()
     cycles = 8_500_000_000 // cycle_ns
-    q, dq, ddq = [0.0] * 6, [0.0] * 6, [0.0] * 6
     accelerations = []
     ahead = copy.deepcopy(state)
     for _ in range(cycles):
-        dmp.ahead(ahead, q, dq, ddq)
-        accelerations.append(list(ddq))
+        accelerations.append(dmp.acceleration_ahead(ahead))
         dmp.step(ahead)
     y, dy = run(dmp, state, cycles)
     phases = np.arange(cycles) * cycle_ns / STRIDE_NS
@@ -69,7 +76,7 @@ def test_steps_solve_the_papers_equations(dmp: RhythmicDmp) -> None:
 
     def rates(t: float, x: np.ndarray) -> np.ndarray:
         f = (basis(np.array([t / tau])) @ dmp.weights)[0]
-        return np.concatenate((x[6:], ALPHA_Z * (ALPHA_Z / 4 * (goal - x[:6]) - x[6:]) + f)) / tau
+        return np.concatenate((x[6:], ALPHA_Z * (BETA_Z * (goal - x[:6]) - x[6:]) + f)) / tau
 
     solution = solve_ivp(rates, (0.0, 0.75), start, method="DOP853", rtol=1e-10, atol=1e-12, t_eval=[0.01, 0.1, 0.75])
     for at, cycles in enumerate((5, 45, 325)):
@@ -87,13 +94,18 @@ def test_looking_ahead_is_what_comes(gait: Gait, cycles: int) -> None:
     state.cycle = 740  # the stride ends within the look-ahead
     state.y[2] += 0.2
     before = (list(state.y), list(state.z), state.cycle)
-    q, dq, ddq = [0.0] * 6, [0.0] * 6, [0.0] * 6
-    dmp.ahead(state, q, dq, ddq)
+    q, dq = [0.0] * 6, [0.0] * 6
+    dmp.ahead(state, q, dq)
+    acceleration = dmp.acceleration_ahead(state)
     assert (state.y, state.z, state.cycle) == before
     for _ in range(cycles):
         dmp.step(state)
     assert q == pytest.approx(state.y, abs=1e-12)
     assert dq == pytest.approx([z / dmp.tau_s for z in state.z], abs=1e-11)
+    f = (basis(np.array([2 * np.pi * dmp.phase(state.cycle)])) @ dmp.weights)[0]
+    gap = np.array(state.goal) - np.array(state.y)
+    wanted = (ALPHA_Z * (BETA_Z * gap - np.array(state.z)) + f) / dmp.tau_s**2  # tau z' with z = tau y'
+    assert acceleration == pytest.approx(wanted.tolist(), abs=1e-9)
 
 
 def test_pushed_off_it_returns_as_a_double_pole(dmp: RhythmicDmp) -> None:
