@@ -8,7 +8,19 @@ import types
 from collections.abc import Callable
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
-from typing import Annotated, ClassVar, Final, TypeAlias, TypeVar, Union, cast, get_args, get_origin, get_type_hints
+from typing import (
+    Annotated,
+    ClassVar,
+    Final,
+    Literal,
+    TypeAlias,
+    TypeVar,
+    Union,
+    cast,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 from pydantic import (
     BeforeValidator,
@@ -63,6 +75,18 @@ class Later:
     """Marks a choice: words that the file format knows and this version does not do yet."""
 
     words: tuple[str, ...]
+
+
+class Choice:
+    """Marks a hint: which words its key `type` may have, and the class behind each."""
+
+    def words(self) -> list[str]:
+        """The words, in the order in which they are shown."""
+        raise NotImplementedError
+
+    def find(self, word: str) -> type[SpecModel] | None:
+        """The class of what has that type, None when there is none; raises ValueError when it cannot be had."""
+        raise NotImplementedError
 
 
 def _duration(given: object) -> int:
@@ -204,6 +228,10 @@ def _walk(model: object, location: tuple[int | str, ...]) -> tuple[Keys, object]
     for item in location:
         bare = _bare(here)
         members = _members(bare)
+        choice = _choice(here)
+        if choice is not None and item != "type":
+            here = choice.find(str(item))
+            continue
         if members:
             here = next((member for member in members if _tag(member) == item), None)
             continue
@@ -236,11 +264,26 @@ def _members(bare: object) -> tuple[object, ...]:
 
 
 def _tag(member: object) -> str:
-    return str(get_args(_hints(member)["type"])[0])
+    """The word a class goes by: its only `type`, or its name when several lead to it."""
+    kind = _hints(member)["type"]
+    return str(get_args(kind)[0]) if get_origin(kind) is Literal else getattr(member, "__name__", str(member))
 
 
 def _tags(hint: object) -> list[str]:
+    choice = _choice(hint)
+    if choice is not None:
+        return choice.words()
     return [_tag(member) for member in _members(_bare(hint))]
+
+
+def _choice(hint: object) -> Choice | None:
+    """The Choice that marks the hint, wherever in it."""
+    if get_origin(hint) in (Union, types.UnionType):
+        return next((found for found in map(_choice, get_args(hint)) if found is not None), None)
+    if get_origin(hint) is not Annotated:
+        return None
+    inner, *marks = get_args(hint)
+    return next((mark for mark in marks if isinstance(mark, Choice)), _choice(inner))
 
 
 def _later(hint: object) -> tuple[str, ...]:

@@ -16,7 +16,8 @@ from canopen_exo.bus.node import NEVER
 from fi_gateway.effects import Effect
 from fi_gateway.errors import FaultError
 from fi_gateway.events import Event
-from fi_gateway.faults import Fault
+from fi_gateway.faults.base import Fault
+from fi_gateway.outlet import Outlet
 
 
 class Phase(Enum):
@@ -36,6 +37,9 @@ ACTIVE: Final = Phase.ACTIVE
 SPENT: Final = Phase.SPENT
 
 _TRIGGER_ON: Final = ("activated",)
+
+_NOWHERE: Final = Outlet()
+"""Refuses later and further frames."""
 
 _ACTIVATION_STATE: Final = (
     "end_ns",
@@ -248,7 +252,7 @@ class Injector:
             current.frames_unfit += 1
             self.too_short += 1
             return frame
-        result = self._fault.apply(now, frame)
+        result = self._fault.apply(now, frame, _NOWHERE)
         if not (result is frame and self._fault.spares):
             self.injected += 1
             current.frames_injected += 1

@@ -1,0 +1,48 @@
+"""Faults as a scenario file gives them: one small class each, and the registry of all (`FAULTS`).
+
+Each reads its own keys, builds the engine's fault, and says in words what it does. `build` raises SpecError when the
+values do not fit the target. Further ones come from other packages, see `fi_gateway.kinds` and docs/faults.md.
+"""
+
+from typing import Annotated, Final, TypeAlias
+
+from fi_gateway.boundary import Later
+from fi_gateway.fault_specs.base import FaultSpec, Payload, Ratio, Scalar, needed_signal, raw_value
+from fi_gateway.fault_specs.bits import BitFlipSpec, BitStuckSpec
+from fi_gateway.fault_specs.forgery import CorruptDlcSpec, InsertSpec, MasqueradeSpec
+from fi_gateway.fault_specs.hold import PackageDropSpec, StuckAtSpec, StuckAtValueSpec, TimeDelaySpec
+from fi_gateway.fault_specs.passage import DelaySpec, DropSpec, DuplicateSpec, ReplaySpec, ResequenceSpec
+from fi_gateway.fault_specs.value import BiasSpec, DriftSpec, GainSpec, NoiseSpec
+from fi_gateway.kinds import Kinds
+
+FAULTS: Final = Kinds(
+    "fault",
+    "exo_hil.faults",
+    FaultSpec,
+    {
+        "stuck_at": StuckAtSpec,
+        "stuck_at_value": StuckAtValueSpec,
+        "package_drop": PackageDropSpec,
+        "time_delay": TimeDelaySpec,
+        "bias": BiasSpec,
+        "gain": GainSpec,
+        "drift": DriftSpec,
+        "noise": NoiseSpec,
+        "bit_flip": BitFlipSpec,
+        "bit_stuck": BitStuckSpec,
+        "drop": DropSpec,
+        "delay": DelaySpec,
+        "resequence": ResequenceSpec,
+        "duplicate": DuplicateSpec,
+        "replay": ReplaySpec,
+        "insert": InsertSpec,
+        "masquerade": MasqueradeSpec,
+        "corrupt_dlc": CorruptDlcSpec,
+    },
+)
+
+FaultChoice: TypeAlias = Annotated[
+    FaultSpec, FAULTS, Later(("bit_error", "stuck_dominant", "no_ack", "babbling_idiot", "bus_off"))
+]
+
+__all__ = ["FAULTS", "FaultChoice", "FaultSpec", "Payload", "Ratio", "Scalar", "needed_signal", "raw_value"]
