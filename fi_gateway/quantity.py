@@ -36,6 +36,7 @@ class Dimension(Enum):
 
     TIME = "duration"
     FREQUENCY = "frequency"
+    RATE = "rate"
     ANGLE = "angle"
     SPEED = "angular velocity"
     TORQUE = "torque"
@@ -48,18 +49,24 @@ UNITS: Final[dict[Dimension, dict[str, Fraction | float]]] = {
         "us": Fraction(1, 10**6),
         "ns": Fraction(1, 10**9),
         "min": Fraction(60),
+        "h": Fraction(3600),
     },
     Dimension.FREQUENCY: {"Hz": _ONE, "kHz": Fraction(1000)},
+    Dimension.RATE: {"1/s": _ONE, "1/min": Fraction(1, 60), "1/h": Fraction(1, 3600)},
     Dimension.ANGLE: {"rad": _ONE, "mrad": _MILLI, "deg": _DEGREE},
     Dimension.SPEED: {"rad/s": _ONE, "deg/s": _DEGREE, "rpm": _RPM},
     Dimension.TORQUE: {"N m": _ONE, "mN m": _MILLI},
 }
 """Unit -> SI per unit; the first unit of each dimension is the SI one. Exact where a fraction."""
 
-_SPELLINGS: Final = {"Nm": "N m", "mNm": "mN m", "µs": "us", "μs": "us"}  # micro sign and Greek mu
+_SPELLINGS: Final = {
+    **{"Nm": "N m", "mNm": "mN m", "µs": "us", "μs": "us"},  # micro sign and Greek mu
+    **{"/s": "1/s", "/min": "1/min", "/h": "1/h"},
+}
 _EXAMPLES: Final = {
     Dimension.TIME: "0.3 s",
     Dimension.FREQUENCY: "500 Hz",
+    Dimension.RATE: "0.5 1/s",
     Dimension.ANGLE: "5 deg",
     Dimension.SPEED: "65.2 rpm",
     Dimension.TORQUE: "5 N m",
@@ -131,6 +138,11 @@ def format_quantity(value: float, dimension: Dimension) -> str:
 def si_unit(dimension: Dimension) -> str:
     """The unit of what `parse_quantity` returns."""
     return next(iter(UNITS[dimension]))
+
+
+def dimension_of(unit: str) -> Dimension | None:
+    """What an SI unit measures, None for a unit that is not the first of a dimension ("" for a plain number)."""
+    return next((dimension for dimension in Dimension if si_unit(dimension) == unit), None)
 
 
 def allowed_units(dimension: Dimension) -> str:
