@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from fi_gateway.boundary import Count, Flag, Share, Span, SpecError
+from fi_gateway.distribution_specs import LawChoice
 from fi_gateway.fault_specs.base import FaultSpec, no_signal
 from fi_gateway.faults import BurstDrop, Delay, Drop, Duplicate, Fault, Replay, Resequence
 from fi_gateway.quantity import format_duration
@@ -59,20 +60,25 @@ class DropSpec(FaultSpec):
 
 @dataclass(frozen=True, slots=True)
 class DelaySpec(FaultSpec):
-    """The frame goes on later; its COB-ID's order is kept unless `reorder`."""
+    """The frame goes on later, by a fixed `time`, one drawn from a `law`, or both; in order unless `reorder`."""
 
     type: Literal["delay"]
-    time_ns: Annotated[Span, Field(alias="time")]
+    time_ns: Annotated[Span | None, Field(alias="time")] = None
+    law: LawChoice | None = None
     reorder: Flag = False
 
     def build(self, place: Place) -> Fault:
         """See Delay."""
         no_signal(place, "delay holds whole frames back (time_delay lets a signal lag)")
-        return Delay(self.time_ns, None, self.reorder)
+        if self.time_ns is None and self.law is None:
+            raise SpecError((), "time or law is missing: how long frames are held back, such as time: 5 ms")
+        return Delay(self.time_ns or 0, None if self.law is None else self.law.build(), self.reorder)
 
     def words(self, place: Place) -> str:
         """For people."""
-        return f"delayed by {format_duration(self.time_ns)}"
+        times = [format_duration(self.time_ns)] if self.time_ns is not None else []
+        times += [f"a time drawn from {self.law.words()}"] if self.law is not None else []
+        return f"delayed by {' and '.join(times)}{', in any order,' if self.reorder else ''}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -43,9 +43,9 @@ class Insert(Fault):
         return frame
 
     def wake(self, now: int, outlet: Outlet) -> None:
-        """One frame; the next one period after this one was due."""
+        """One frame; the next one a period after this one was due, or more whole ones if that is over."""
         outlet.insert(self._frame)
-        self.wake_at += self._every_ns
+        self.wake_at += self._every_ns * (1 + max(0, now - self.wake_at) // self._every_ns)
 
     def end(self) -> None:
         """No more."""

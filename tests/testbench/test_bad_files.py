@@ -77,7 +77,7 @@ TABLE: list[tuple[str, ...]] = [
     ("signal the other way", "to_controller", "§to_drives", "position of right_knee does not travel to_drives"),
     ("unknown direction", "to_controller", "§to_master", "unknown bus 'to_master'", "to_controller, to_drives, both"),
     ("unknown fault", "stuck_at}", "§stuckat}", "unknown fault 'stuckat'", "did you mean 'stuck_at'", "bit_flip"),
-    ("fault of a later version", "stuck_at}", "§noise}", "'noise' is not available yet", "stuck_at, stuck_at_value"),
+    ("fault of a later version", "stuck_at}", "§no_ack}", "'no_ack' is not available yet", "stuck_at, stuck_at_value"),
     ("whole-frame fault on a signal", "stuck_at}", "§drop}", "drop loses whole frames", "give pdo instead of position"),
     ("unknown trigger", "[freeze]", "[§freze]", "no injector is called 'freze'", "did you mean 'freeze'", "zero"),
     (

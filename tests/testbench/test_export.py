@@ -90,6 +90,9 @@ def _fits(keyword: str, wanted: object, schema: dict[str, object], value: Data, 
     if keyword == "minimum":
         assert isinstance(wanted, int)
         return not isinstance(value, int) or value >= wanted
+    if keyword == "maximum":
+        assert isinstance(wanted, int)
+        return not isinstance(value, int) or value <= wanted
     if keyword == "required":
         assert isinstance(wanted, list)
         return not isinstance(value, dict) or set(wanted) <= set(value)
