@@ -7,6 +7,7 @@ from typing import Final, final
 
 from mypy_extensions import mypyc_attr
 
+from canopen_exo.bus.frame import Frame
 from canopen_exo.bus.node import NEVER
 from fi_gateway.errors import FaultError
 
@@ -16,16 +17,25 @@ class Effect:
     """How long an activation lasts.
 
     frames: it ends after this many frames the fault acted on, 0 for no limit; rearms: whether the injector waits for
-    its event or trigger again afterwards, or is spent for the run.
+    its event or trigger again afterwards, or is spent for the run; watches: (port, COB-ID) of the frames it wants to
+    observe.
     """
 
-    def __init__(self, frames: int = 0, rearms: bool = False) -> None:
+    def __init__(self, frames: int = 0, rearms: bool = False, watches: tuple[tuple[int, int], ...] = ()) -> None:
         self.frames: int = frames
         self.rearms: bool = rearms
+        self.watches: tuple[tuple[int, int], ...] = watches
 
     def duration(self) -> int:
         """Length of the activation that starts now, ns, NEVER for no limit; drawn anew for each activation."""
         return NEVER
+
+    def observe(self, now: int, frame: Frame) -> bool:
+        """A watched frame has come in at `now`, see `Event.observe`; True: an open window ends at `now`.
+
+        Called for every one of them, window or not: what is true between activations ends none.
+        """
+        return False
 
 
 @final

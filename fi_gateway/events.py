@@ -11,24 +11,41 @@ from typing import Final, final
 from mypy_extensions import mypyc_attr
 from numpy.random import Generator
 
+from canopen_exo.bus.frame import Frame
 from canopen_exo.bus.node import NEVER
 from fi_gateway.errors import FaultError
 
 
 @mypyc_attr(allow_interpreted_subclasses=True)
 class Event:
-    """When an injector activates; belongs to one injector."""
+    """When an injector activates; belongs to one injector.
+
+    watches: (port, COB-ID) of the frames it wants to observe, as they come in on that port, before any fault;
+    watches_target: it wants to observe the frames of its injector's target, as they reach that injector.
+    """
+
+    def __init__(self, watches: tuple[tuple[int, int], ...] = (), watches_target: bool = False) -> None:
+        self.watches: tuple[tuple[int, int], ...] = watches
+        self.watches_target: bool = watches_target
 
     def first(self) -> int:
         """The first activation, ns, NEVER for none."""
         return self.next(0)
 
     def next(self, after: int) -> int:
-        """The next activation, ns, for an injector that became free at `after` [ns]; NEVER for none.
+        """The next activation, ns, for an injector that became free at `after` [ns]; NEVER for none of itself.
 
         `after` does not fall from call to call; an event that was announced and not used up stays valid.
         """
-        raise NotImplementedError
+        return NEVER
+
+    def observe(self, now: int, frame: Frame) -> bool:
+        """A watched frame has come in at `now`; True: an armed injector activates now, so that this frame is met.
+
+        now: ns after time 0 (or power-up) like the times of `next`, negative while that has not come. Called for every
+        such frame, whatever the injector is doing, so that nothing is missed; unless it is armed, True means nothing.
+        """
+        return False
 
 
 @final
@@ -39,6 +56,7 @@ class At(Event):
     """
 
     def __init__(self, times_ns: tuple[int, ...]) -> None:
+        super().__init__()
         self._times: Final[list[int]] = sorted(set(times_ns))
         if not self._times or self._times[0] < 0 or self._times[-1] >= NEVER:
             raise FaultError(f"at: times {times_ns} ns given, allowed are one or more times 0..{NEVER - 1} ns")
@@ -64,6 +82,7 @@ class FailureProbability(Event):
     """
 
     def __init__(self, probability: float, period_ns: int, rng: Generator) -> None:
+        super().__init__()
         if not 0.0 <= probability <= 1.0:
             raise FaultError(f"failure_probability: p {probability} given, allowed 0..1 per period")
         if period_ns <= 0:

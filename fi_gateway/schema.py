@@ -15,11 +15,12 @@ from canopen_exo.plan import BusPlan
 from fi_gateway.boundary import Flag, Later, SpecError, SpecModel, Text, validate
 from fi_gateway.errors import FaultError
 from fi_gateway.fault_specs import FaultChoice, FaultSpec
-from fi_gateway.injector import Injector, Target, Trigger, stream
+from fi_gateway.injector import Injector, Target, stream
 from fi_gateway.marked_yaml import Data, Keys, did_you_mean, dotted
 from fi_gateway.quantity import format_duration
 from fi_gateway.target import TargetSpec, resolve
 from fi_gateway.timing_specs import EffectChoice, EventChoice
+from fi_gateway.trigger import Trigger
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,7 +16,7 @@ from canopen_exo.bus.frame import Frame
 from canopen_exo.bus.lateness import LatenessDocument
 from canopen_exo.bus.node import NEVER
 from canopen_exo.bus.trace import candump_frame, trace_hash
-from fi_gateway.injector import Activation
+from fi_gateway.activation import Activation
 from testbench.errors import BenchError
 from testbench.golden import JointComparison
 from testbench.record import RunRecord

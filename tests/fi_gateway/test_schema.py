@@ -12,6 +12,7 @@ from fi_gateway.boundary import validate
 from fi_gateway.errors import FaultError
 from fi_gateway.injector import Injector
 from fi_gateway.marked_yaml import FileErrors, parse
+from fi_gateway.outlet import Tray
 from fi_gateway.schema import (
     InjectorSpec,
     build_injectors,
@@ -70,7 +71,7 @@ def built(fault: str, target: str = POSITION) -> Injector:
 
 def outcome(fault: str, target: str = POSITION, data: bytes = bytes(8)) -> bytes | None:
     """What becomes of a TPDO1 of the right knee."""
-    result = built(fault, target).act(1, Frame(0x185, data))
+    result = built(fault, target).act(1, 1, Frame(0x185, data), Tray())
     return None if result is None else result.data
 
 
@@ -125,7 +126,7 @@ def test_a_plain_number_sets_a_signal_without_unit() -> None:
     found = build_injectors(read(a=injector("{type: stuck_at_value, value: 0x27}", target)), PLAN, 1, 0)[0]
     found.start(0)
     found.open(0, "test")
-    result = found.act(1, Frame(0x285, bytes(6)))
+    result = found.act(1, 1, Frame(0x285, bytes(6)), Tray())
     assert result is not None
     assert result.data == bytes.fromhex("270000000000")
 
@@ -134,7 +135,7 @@ def test_drop_loses_the_frame_or_some_of_them() -> None:
     """Probability 1 by default, or as given."""
     assert outcome("{type: drop}", TPDO1) is None
     active = built("{type: drop, probability: 20 %}", TPDO1)
-    lost = sum(active.act(1, Frame(0x185, bytes(8))) is None for _ in range(2000))
+    lost = sum(active.act(1, 1, Frame(0x185, bytes(8)), Tray()) is None for _ in range(2000))
     assert abs(lost - 400) < 4 * (2000 * 0.2 * 0.8) ** 0.5  # 4 sigma of a binomial
 
 
@@ -144,7 +145,7 @@ def test_bits_fixed_stay_for_the_activation(bits: str, fixed: bool) -> None:
     active = built(f"{{type: bit_flip, count: 3{bits}}}")
     seen = set()
     for _ in range(50):
-        result = active.act(1, Frame(0x185, bytes(8)))
+        result = active.act(1, 1, Frame(0x185, bytes(8)), Tray())
         assert result is not None
         word = int.from_bytes(result.data, "little")
         assert word.bit_count() == 3
