@@ -10,7 +10,8 @@ from fi_gateway.boundary import Flag, Span, SpecError, Whole
 from fi_gateway.fault_specs.base import FaultSpec, Payload, no_signal
 from fi_gateway.faults import CorruptDlc, Fault, Insert, Masquerade
 from fi_gateway.quantity import format_duration
-from fi_gateway.target import CobId, Place
+from fi_gateway.target import Place
+from fi_gateway.trigger_specs import CobId
 
 
 @dataclass(frozen=True, slots=True)
