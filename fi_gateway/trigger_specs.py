@@ -6,23 +6,17 @@ Each reads its own keys, builds the engine's object, and says in words what it d
 from dataclasses import dataclass
 from typing import Annotated, Final, Literal, TypeAlias
 
-from pydantic import Field, PlainSerializer, PlainValidator, WithJsonSchema
+from pydantic import Field
 
 from canopen_exo.bus.frame import Frame
 from fi_gateway.boundary import Count, Share, SpecError, SpecModel, Text, Time, Whole
-from fi_gateway.fault_specs import Payload
+from fi_gateway.fault_specs import CobId, Payload
 from fi_gateway.quantity import format_duration
 from fi_gateway.repair import Repair
-from fi_gateway.target import TO_CONTROLLER, TO_DRIVES, BitsSpec, Place, cob_id
+from fi_gateway.target import TO_CONTROLLER, TO_DRIVES, BitsSpec, Place
 from fi_gateway.trigger import BusFrame, Report, Trigger
 
 Names: TypeAlias = Annotated[tuple[Text, ...], Field(min_length=1)]
-CobId: TypeAlias = Annotated[
-    int,
-    PlainValidator(cob_id),
-    PlainSerializer(lambda value: f"0x{value:03X}"),
-    WithJsonSchema({"type": ["integer", "string"]}),
-]
 Way: TypeAlias = Literal["to_controller", "to_drives", "both"]
 Signal: TypeAlias = Literal["activated", "manifested", "ended"]
 

@@ -7,7 +7,7 @@ values do not fit the target. Further ones come from other packages, see `fi_gat
 from typing import Annotated, Final, TypeAlias
 
 from fi_gateway.boundary import Later
-from fi_gateway.fault_specs.base import FaultSpec, Payload, Ratio, Scalar, needed_signal, raw_value
+from fi_gateway.fault_specs.base import CobId, FaultSpec, Payload, Ratio, Scalar, needed_signal, raw_value
 from fi_gateway.fault_specs.bits import BitFlipSpec, BitStuckSpec
 from fi_gateway.fault_specs.forgery import CorruptDlcSpec, InsertSpec, MasqueradeSpec
 from fi_gateway.fault_specs.hold import PackageDropSpec, StuckAtSpec, StuckAtValueSpec, TimeDelaySpec
@@ -45,4 +45,4 @@ FaultChoice: TypeAlias = Annotated[
     FaultSpec, FAULTS, Later(("bit_error", "stuck_dominant", "no_ack", "babbling_idiot", "bus_off"))
 ]
 
-__all__ = ["FAULTS", "FaultChoice", "FaultSpec", "Payload", "Ratio", "Scalar", "needed_signal", "raw_value"]
+__all__ = ["FAULTS", "CobId", "FaultChoice", "FaultSpec", "Payload", "Ratio", "Scalar", "needed_signal", "raw_value"]

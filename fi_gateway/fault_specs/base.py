@@ -3,13 +3,13 @@
 import re
 from typing import Annotated, Final, TypeAlias
 
-from pydantic import PlainValidator, WithJsonSchema
+from pydantic import PlainSerializer, PlainValidator, WithJsonSchema
 
 from canopen_exo.signal import Signal
 from fi_gateway.boundary import SpecError, SpecModel
 from fi_gateway.faults import Fault
 from fi_gateway.quantity import Dimension, QuantityError, describe_value, parse_quantity
-from fi_gateway.target import Place
+from fi_gateway.target import Place, cob_id
 
 _DIMENSIONS: Final = {"rad": Dimension.ANGLE, "rad/s": Dimension.SPEED, "N m": Dimension.TORQUE}
 _COUNTS: Final = {"rad": "counts", "rad/s": "counts/s"}
@@ -18,7 +18,7 @@ _COUNTED: Final = re.compile(r"([+-]?[0-9]{1,20}(?:\.[0-9]{0,20})?)\s*(counts(?:
 _PER_TIME: Final = re.compile(r"(.*?)\s*/\s*(s|ms|min)", re.ASCII)
 _SECONDS: Final = {"s": 1.0, "ms": 1e-3, "min": 60.0}
 _SLOPES: Final = {"rad": "1 deg/s", "rad/s": "10 rpm/s", "N m": "0.5 N m/s", "": "3 /s"}
-_PAYLOAD: Final = re.compile(r"([0-9a-fA-F]{2}( [0-9a-fA-F]{2}){0,7})?", re.ASCII)
+_PAYLOAD: Final = re.compile(r"[0-9a-fA-F]{2}( [0-9a-fA-F]{2}){0,7}", re.ASCII)
 _RATIO: Final = re.compile(r"([+-]?[0-9]{1,9}(?:\.[0-9]{0,20})?)\s*%", re.ASCII)
 _MOST_RATIO: Final = 1e9
 
@@ -33,8 +33,13 @@ def _scalar(given: object) -> str | int | float:
 def _payload(given: object) -> str:
     if not isinstance(given, str) or not _PAYLOAD.fullmatch(given):
         got = describe_value(given)
-        raise ValueError(f"expected 0 to 8 bytes in hexadecimal with spaces, in quotes, such as '00 1F A0'; got {got}")
+        raise ValueError(f"expected 1 to 8 bytes in hexadecimal with spaces, in quotes, such as '00 1F A0'; got {got}")
     return given.upper()
+
+
+def _payload_or_none(given: object) -> str:
+    """As _payload; "" for no bytes at all."""
+    return "" if given == "" else _payload(given)
 
 
 def _ratio(given: object) -> float:
@@ -53,6 +58,13 @@ Scalar: TypeAlias = Annotated[
     str | int | float, PlainValidator(_scalar), WithJsonSchema({"type": ["string", "number"]})
 ]
 Payload: TypeAlias = Annotated[str, PlainValidator(_payload), WithJsonSchema({"type": "string"})]
+AnyPayload: TypeAlias = Annotated[str, PlainValidator(_payload_or_none), WithJsonSchema({"type": "string"})]
+CobId: TypeAlias = Annotated[
+    int,
+    PlainValidator(cob_id),
+    PlainSerializer(lambda value: f"0x{value:03X}"),
+    WithJsonSchema({"type": ["integer", "string"]}),
+]
 Ratio: TypeAlias = Annotated[
     float, PlainValidator(_ratio), WithJsonSchema({"type": ["number", "string"], "examples": [1.2, "120 %"]})
 ]

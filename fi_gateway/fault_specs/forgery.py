@@ -7,11 +7,10 @@ from pydantic import Field
 
 from canopen_exo.bus.frame import Frame
 from fi_gateway.boundary import Flag, Span, SpecError, Whole
-from fi_gateway.fault_specs.base import FaultSpec, Payload, no_signal
+from fi_gateway.fault_specs.base import AnyPayload, CobId, FaultSpec, no_signal
 from fi_gateway.faults import CorruptDlc, Fault, Insert, Masquerade
 from fi_gateway.quantity import format_duration
 from fi_gateway.target import Place
-from fi_gateway.trigger_specs import CobId
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,7 +18,7 @@ class InsertSpec(FaultSpec):
     """A further frame: `every` so often, or ahead of each target frame; its COB-ID is the target's by default."""
 
     type: Literal["insert"]
-    payload: Payload
+    payload: AnyPayload
     cob_id: CobId | None = None
     every_ns: Annotated[Span | None, Field(alias="every")] = None
 

@@ -207,7 +207,7 @@ REFUSED: Final = [
     ("{type: replay}", TPDO1, ["a.fault.frames: missing; needed: type, frames"]),
     ("{type: replay, frames: 3, mode: mix}", TPDO1, ["a.fault.mode: unknown mode 'mix' (allowed: replace, add)"]),
     ("{type: insert}", TPDO1, ["a.fault.payload: missing; needed: type, payload"]),
-    ("{type: insert, payload: 1}", TPDO1, ["a.fault.payload: expected 0 to 8 bytes in hexadecimal", "got 1"]),
+    ("{type: insert, payload: 1}", TPDO1, ["a.fault.payload: expected 1 to 8 bytes in hexadecimal", "got 1"]),
     ("{type: insert, payload: '01'}", EVERY_TPDO1, ["a.fault: cob_id is missing", "has 6 of them"]),
     ("{type: insert, payload: '01', every: 5 ms}", UNKNOWN, ["a.fault.every: in which direction?", "bus: both"]),
     ("{type: insert, payload: '01', every: 0 s}", TPDO1, ["a.fault.every: '0 s' is not a length of time"]),

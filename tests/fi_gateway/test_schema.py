@@ -219,7 +219,7 @@ def test_switches_and_triggers_reach_the_engine() -> None:
         ("{type: stuck_at_value, value: 1 rad}", TPDO1, ["a.fault.value: the target is a whole frame"]),
         ("{type: stuck_at_value, payload: 00 00}", POSITION, ["a.fault.payload: the target is a signal"]),
         ("{type: stuck_at_value, payload: 00 00}", TPDO1, ["a.fault.payload: 2 bytes given", "carries 8"]),
-        ("{type: stuck_at_value, payload: 0}", TPDO1, ["a.fault.payload: expected 0 to 8 bytes", "got 0"]),
+        ("{type: stuck_at_value, payload: 0}", TPDO1, ["a.fault.payload: expected 1 to 8 bytes", "got 0"]),
         ("{type: bias, value: 1 rad}", TPDO1, ["a.fault.type: bias acts on a signal", "add signal"]),
         ("{type: bias}", POSITION, ["a.fault.value: missing; needed: type, value"]),
         ("{type: bias, value: 1e-5 rad}", POSITION, ["less than half of one count (4.79e-05 rad)"]),
