@@ -49,7 +49,7 @@ class Kinds(Choice, Generic[S]):
         installed = self._installed.get(word)
         if installed is not None:
             if len(installed) > 1:
-                paths = ", ".join(sorted(entry.value for entry in installed))
+                paths = ", ".join(sorted(entry.value.replace(":", ".") for entry in installed))
                 raise ValueError(f"several installed packages call a {self.what} {word!r}; give one of {paths} instead")
             module, _, name = installed[0].value.partition(":")
             return self._load(module, name)

@@ -1,0 +1,1 @@
+"""A fault type of one's own: a value known only in coarse steps."""
