@@ -168,7 +168,7 @@ def test_events_and_effects_have_the_times_of_the_file(event: str, effect: str, 
     """Durations are exact ns; `per: sync` is one control cycle."""
     spec = read(a=injector(event=event, effect=effect))["a"]
     assert spec.event.build(PLAN, np.random.default_rng(0)).first() == first
-    assert spec.effect.build().duration() == length
+    assert spec.effect.build(PLAN, np.random.default_rng(0)).duration() == length
 
 
 def test_injectors_are_built_in_written_order_with_their_own_streams() -> None:
