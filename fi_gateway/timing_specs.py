@@ -92,10 +92,11 @@ class Timing:
         if found is None:
             return text
         motion = format_duration(duration_ns)
-        if found.activations is None or found.activations == found.share:  # never more than one in a motion
+        if found.activations is None or found.activations == found.share or found.share < 0.5:
             share = f"{100 * found.share:.0f} %" if found.share >= _RARE else f"fewer than {100 * _RARE:.0f} %"
             return f"{text}, activated in {share} of the runs of {motion}"
-        return f"{text}, about {found.activations:.1f} activations of {name} expected in {motion}, dead time included"
+        number = f"{found.activations:.1f}" if found.activations < 10 else f"{found.activations:.0f}"
+        return f"{text}, about {number} activations of {name} expected in {motion}, dead time included"
 
     def warnings(self, place: Place, plan: BusPlan, duration_ns: int) -> list[tuple[str, str]]:
         """(key, what looks like a mistake), for times that count from time 0 of a motion of that length."""
