@@ -44,6 +44,10 @@ class EventSpec(SpecModel):
         """
         return self.build(plan, rng)
 
+    def counts_frames(self) -> bool:
+        """Whether it comes with frames of the target; its stand-in then has the k-th frame at k times their distance."""
+        return False
+
     def times(self) -> tuple[int, ...]:
         """The times at which it happens [ns], in order, where the file gives them; else ()."""
         return ()
@@ -114,6 +118,10 @@ class FailureProbabilitySpec(EventSpec):
         if self.per != "frame":
             return self.build(plan, rng)
         return FailureProbability(self.p, frame_ns, rng) if frame_ns else None
+
+    def counts_frames(self) -> bool:
+        """Per frame it does."""
+        return self.per == "frame"
 
     def silent(self, plan: BusPlan) -> str:
         """With p = 0."""
@@ -211,6 +219,10 @@ class EverySpec(EventSpec):
     def stand_in(self, plan: BusPlan, rng: Generator, frame_ns: int) -> Event | None:
         """A certain event on a grid of n mean distances of frames."""
         return FailureProbability(1.0, self.n * frame_ns, rng) if frame_ns else None
+
+    def counts_frames(self) -> bool:
+        """It does."""
+        return True
 
     def words(self, plan: BusPlan) -> str:
         """For people."""

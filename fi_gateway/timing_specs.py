@@ -68,7 +68,8 @@ class Timing:
         if event is None:
             return None
         count, time = 0, event.first()
-        while time < duration_ns:
+        end_ns = duration_ns + 1 if self.event.counts_frames() else duration_ns  # a last frame comes before the end
+        while time < end_ns:
             count += 1
             if effect is None or count == self.max_activations or not self._rearms(effect.rearms):
                 break

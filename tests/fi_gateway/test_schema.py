@@ -390,7 +390,7 @@ def test_chains_may_branch_and_join_but_not_go_round(triggers: dict[str, str], c
         ({"a": injector(event="{type: mttf, mean: 1 h, sd: 60 s}", more=", from: power_up")}, []),
         ({"a": injector(event="{type: rate, lambda: 1/h}")}, ["a.event: comes in fewer than 1 % of the runs"]),
         ({"a": injector(event="{type: every, n: 3501}")}, ["a.event: comes in fewer than 1 % of the runs"]),
-        ({"a": injector(event="{type: every, n: 3499}")}, []),
+        ({"a": injector(event="{type: every, n: 3500}")}, []),
         ({"a": injector(event="{type: gait_phase, phase: 0}",
                         effect="{type: until, condition: right_hip.torque > 9000 N m}")},
          ["a.effect: lasts until the end of the run: its signals never reach right_hip.torque > 9000 N m"]),

@@ -62,9 +62,9 @@ def expected_of_rate(rate: float, length_s: float) -> float:
         ("{type: mttf, mean: 2 s, sd: 1 ms}", "{type: constant_time, duration: 0.3 s}", 3),
         ("{type: distribution, law: {type: binomial, n: 1, p: 1, period: 1 s}}",
          "{type: distribution, law: {type: binomial, n: 1, p: 1, period: 1 s}}", 3),  # at 1, 3 and 5 s
-        ("{type: every, n: 100}", "{type: constant_time, duration: 0.3 s}", 17),  # at 0.2, 0.6 .. 6.6 s
-        ("{type: every, n: 100}", "{type: frames, n: 100}", 34),
-        ("{type: failure_probability, p: 1, per: frame}", "{type: constant_time, duration: 2 ms}", 1750),
+        ("{type: every, n: 100}", "{type: constant_time, duration: 0.3 s}", 18),  # at 0.2, 0.6 .. 7 s, the 3500th frame
+        ("{type: every, n: 100}", "{type: frames, n: 100}", 35),
+        ("{type: failure_probability, p: 1, per: frame}", "{type: constant_time, duration: 3 ms}", 1750),
     ],
 )  # fmt: skip
 def test_the_number_of_activations_is_that_of_renewal_theory(event: str, effect: str, activations: float) -> None:
@@ -81,7 +81,7 @@ def test_the_number_of_activations_is_that_of_renewal_theory(event: str, effect:
     ("event", "share"),
     [
         ("{type: failure_probability, p: 0.0001, per: 1 ms}", 1 - 0.9999**6999),
-        ("{type: failure_probability, p: 0.0001, per: frame}", 1 - 0.9999**3499),
+        ("{type: failure_probability, p: 0.0001, per: frame}", 1 - 0.9999**3500),
         ("{type: rate, lambda: 2 1/min}", 1 - exp(-7 / 30)),
         ("{type: distribution, law: {type: weibull, shape: 2, scale: 10 s}}", 1 - exp(-0.49)),
     ],
@@ -97,13 +97,13 @@ def test_what_comes_once_a_run_comes_in_a_share_of_the_runs(event: str, share: f
 def test_rearm_and_max_activations_override_the_effect() -> None:
     """Spent after the first, or after so many; or armed again."""
     event, constant = "{type: every, n: 100}", "{type: constant_time, duration: 1 ms}"
-    for more, count in (({}, 34), ({"rearm": False}, 1), ({"max_activations": 3}, 3), ({"max_activations": 99}, 34)):
+    for more, count in (({}, 35), ({"rearm": False}, 1), ({"max_activations": 3}, 3), ({"max_activations": 99}, 35)):
         found = timing(event, constant, **more).forecast(PLAN, SAMPLES, MOTION)
         assert found is not None
         assert found.activations == count
     found = timing(event, "{type: once}", rearm=True).forecast(PLAN, SAMPLES, MOTION)
     assert found is not None
-    assert found.activations == 34
+    assert found.activations == 35
 
 
 def test_a_very_high_rate_is_reckoned_on() -> None:
