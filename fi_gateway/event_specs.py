@@ -45,7 +45,7 @@ class EventSpec(SpecModel):
         return self.build(plan, rng)
 
     def counts_frames(self) -> bool:
-        """Whether it comes with frames of the target; its stand-in then has the k-th frame at k times their distance."""
+        """Whether it comes with frames of the target; its stand-in has the k-th frame at k times their distance."""
         return False
 
     def times(self) -> tuple[int, ...]:
