@@ -15,8 +15,10 @@ from mypy_extensions import mypyc_attr
 from numpy.random import Generator
 
 from canopen_exo.bus.frame import Frame
+from canopen_exo.bus.node import NEVER
 from canopen_exo.signal import Signal
 from fi_gateway.errors import FaultError
+from fi_gateway.outlet import Outlet
 
 
 @mypyc_attr(allow_interpreted_subclasses=True)
@@ -24,7 +26,8 @@ class Fault:
     """What happens to the frames of an active injector.
 
     signal: what it acts on, None for the whole payload or frame; saturated: frames of the current or last activation
-    whose value was cut at the signal's range; spares: whether `apply` giving the frame itself means it was left alone.
+    whose value was cut at the signal's range; spares: whether `apply` giving the frame itself means it was left alone;
+    wake_at: absolute time [ns], while active, at which it wants `wake`, to insert without being asked; NEVER for none.
     Values here are made for one injector and not shared.
     """
 
@@ -32,6 +35,7 @@ class Fault:
         self.signal: Signal | None = signal
         self.saturated: int = 0
         self.spares: bool = False
+        self.wake_at: int = NEVER
 
     def begin(self, now: int, held: dict[int, Frame], rng: Generator) -> bool:
         """The injector activates at `now` [ns]; False: cannot act yet, ask again at the next frame.
@@ -46,8 +50,15 @@ class Fault:
         """Whether the fault can act on this frame; if not, it passes unchanged and is counted."""
         return self.signal is None or self.signal.fits(frame.data)
 
-    def apply(self, now: int, frame: Frame) -> Frame | None:
-        """The frame that goes on instead, `frame` itself when nothing changes, None when it is lost. It `fits`."""
+    def apply(self, now: int, frame: Frame, outlet: Outlet) -> Frame | None:
+        """The frame that goes on instead, `frame` itself when nothing changes. It `fits`.
+
+        None: it does not go on now: lost, unless it was given to `outlet.later`.
+        """
+        raise NotImplementedError
+
+    def wake(self, now: int, outlet: Outlet) -> None:
+        """`wake_at` is reached; `now` is that time. Must move `wake_at` on."""
         raise NotImplementedError
 
     def end(self) -> None:
@@ -98,7 +109,7 @@ class StuckAt(Fault):
         payload = self._payloads.get(frame.can_id)
         return payload is None or len(payload) == len(frame.data)
 
-    def apply(self, now: int, frame: Frame) -> Frame | None:
+    def apply(self, now: int, frame: Frame, outlet: Outlet) -> Frame | None:
         """The frame with the held value."""
         if self.signal is not None:
             return with_payload(frame, self.signal.write(frame.data, self._raw))
@@ -130,7 +141,7 @@ class StuckAtValue(Fault):
         self._target: Final[Signal] = signal
         self._raw: Final[int] = raw
 
-    def apply(self, now: int, frame: Frame) -> Frame | None:
+    def apply(self, now: int, frame: Frame, outlet: Outlet) -> Frame | None:
         """The frame with the given value."""
         return with_payload(frame, self._target.write(frame.data, self._raw))
 
@@ -155,7 +166,7 @@ class StuckAtPayload(Fault):
         """The frame is as long as the given payload."""
         return len(frame.data) == len(self._payload)
 
-    def apply(self, now: int, frame: Frame) -> Frame | None:
+    def apply(self, now: int, frame: Frame, outlet: Outlet) -> Frame | None:
         """The frame with the given payload."""
         return with_payload(frame, self._payload)
 
@@ -178,7 +189,7 @@ class Bias(Fault):
         self._low: Final[int] = signal.low
         self._high: Final[int] = signal.high
 
-    def apply(self, now: int, frame: Frame) -> Frame | None:
+    def apply(self, now: int, frame: Frame, outlet: Outlet) -> Frame | None:
         """The frame with the biased value."""
         raw = self._target.read(frame.data) + self._raw_offset
         if raw > self._high:
@@ -215,7 +226,7 @@ class Drop(Fault):
         self._rng = rng
         return True
 
-    def apply(self, now: int, frame: Frame) -> Frame | None:
+    def apply(self, now: int, frame: Frame, outlet: Outlet) -> Frame | None:
         """None, or the frame itself when the draw spares it."""
         if self._probability >= 1.0:
             return None
@@ -276,7 +287,7 @@ class BitFlip(Fault):
         need = self._mask.bit_length() if self._mask else self._count
         return need <= 8 * len(frame.data)
 
-    def apply(self, now: int, frame: Frame) -> Frame | None:
+    def apply(self, now: int, frame: Frame, outlet: Outlet) -> Frame | None:
         """The frame with its bits inverted."""
         size = len(frame.data)
         mask = self._mask

@@ -13,8 +13,9 @@ When the controller says that the motion is over (state STOPPED), they are inert
 Events that were due before time 0 was known open their windows with their true times; frames already gone stay as they
 were.
 
-Order at one instant: windows that end close, windows that are due open, triggers settle along the trigger graph, then
-the faults act on the frame in the order written; a frame lost by one injector does not reach the next.
+Order at one instant: windows that end close, windows that are due open, triggers settle along the trigger graph
+(`windows`), then the faults act on the frame in the order written (`passage`); a frame lost by one injector does not
+reach the next.
 
 Error frames are notices here (`port_changed`), counted and never forwarded. While the port to send on is down or
 bus-off, frames for it are counted as undelivered, so that no old command waits for the bus to come back; one frame
@@ -28,9 +29,11 @@ from mypy_extensions import mypyc_attr
 
 from canopen_exo.bus.frame import Frame
 from canopen_exo.bus.node import MS, NEVER, ErrorState, Node, Out, PortState
-from canopen_exo.plan import HLC_STATUS, STATUS_MOTION, STATUS_STOPPED, SYNC
+from canopen_exo.plan import STATUS_MOTION, STATUS_STOPPED
+from fi_gateway.activation import Activation
 from fi_gateway.errors import FaultError
-from fi_gateway.injector import ACTIVE, ARMED, WAITING, Activation, Injector, graph_order
+from fi_gateway.injector import Injector
+from fi_gateway.passage import COMMAND, PLAIN, SYNC_READ, Passage, Route
 
 CONTROLLER_PORT: Final = 0
 DRIVE_PORT: Final = 1
@@ -38,7 +41,6 @@ DRIVE_PORT: Final = 1
 _STATE: Final = (
     "wake_at",
     "frames",
-    "lost",
     "undelivered",
     "notices",
     "port_changes",
@@ -46,8 +48,6 @@ _STATE: Final = (
     "time_zero",
     "_last_sync",
     "_power_up",
-    "_waiting",
-    "_records",
     "_states",
     "_away",
     "_probe_at",
@@ -56,36 +56,11 @@ _STATE: Final = (
 """What `__reduce__` copies besides the constructor arguments; the routes are laid afresh, and what is attached stays
 with the original."""
 
-_PLAIN: Final = 0
-_SYNC: Final = 1
-_STATUS: Final = 2
-_COMMAND: Final = 3
-
 _PROBE_NS: Final = 20 * MS
 """While a port is away: the distance of frames that are offered to it all the same."""
 
 _CHANGES_KEPT: Final = 4096
 """A bus that flaps for days must not fill the memory; `notices` goes on counting."""
-
-
-@final
-class _Route:
-    """What is to be done with one COB-ID in one direction. kind: what the gateway itself reads from it."""
-
-    def __init__(self, kind: int) -> None:
-        self.kind: Final[int] = kind
-        self.injectors: list[Injector] = []
-
-
-@final
-class _Link:
-    """An injector and those whose activation starts it. opened: in the present settling; fired: by live control."""
-
-    def __init__(self, injector: Injector, sources: list["_Link"]) -> None:
-        self.injector: Final[Injector] = injector
-        self.sources: Final[list[_Link]] = sources
-        self.opened: bool = False
-        self.fired: bool = False
 
 
 @final
@@ -125,21 +100,21 @@ class CommandPort:
 class Gateway(Node):
     """Two ports: CONTROLLER_PORT and DRIVE_PORT. What comes in on one goes out on the other.
 
-    injectors: in the order in which their faults apply; cycle_ns: SYNC period, ns.
-    frames, lost, undelivered: received, lost by a fault, and not offered because the other port is away, by the port
-    they came in on; notices: error notices by port; port_changes: those that changed a port's state; malformed: status
-    frames too short to read. time_zero: ns, NEVER until known.
+    injectors: in the order in which their faults apply; cycle_ns: SYNC period, ns; passage: for a copy, that of the
+    original.
+    frames, lost, inserted, undelivered: received, lost and added by faults, and not offered because the other port is
+    away, by the port they came in on; waiting: frames that go on later; notices: error notices by port; port_changes:
+    those that changed a port's state; malformed: status frames too short to read. time_zero: ns, NEVER until known.
 
     Nine public methods: four are a Node's life and its end, five are what live control is made of.
     """
 
-    def __init__(self, injectors: list[Injector], cycle_ns: int) -> None:
+    def __init__(self, injectors: list[Injector], cycle_ns: int, passage: Passage | None = None) -> None:
         super().__init__()
         if cycle_ns <= 0:
             raise FaultError(f"gateway: SYNC period {cycle_ns} ns given, allowed 1 ns and more")
         self.injectors: Final[list[Injector]] = list(injectors)
         self.frames: list[int] = [0, 0]
-        self.lost: list[int] = [0, 0]
         self.undelivered: list[int] = [0, 0]
         self.notices: list[int] = [0, 0]
         self.port_changes: list[PortChange] = []
@@ -147,24 +122,38 @@ class Gateway(Node):
         self.time_zero: int = NEVER
         self._cycle_ns: Final[int] = cycle_ns
         self._last_sync: int = -NEVER
-        self._power_up: int = NEVER
-        self._waiting: bool = False
-        self._records: list[Activation] = []
+        self._power_up: int = 0
         self._commands: CommandPort | None = None
-        self._unreported: list[Activation] = []
         self._states: list[ErrorState] = [ErrorState.ERROR_ACTIVE, ErrorState.ERROR_ACTIVE]
         self._away: list[bool] = [False, False]
         self._probe_at: list[int] = [0, 0]
         self._is_disturbed: bool = False
-        self._links: Final[list[_Link]] = _links(injectors)
-        self._from_controller: Final[list[_Route | None]] = [None] * 0x800
-        self._from_drives: Final[list[_Route | None]] = [None] * 0x800
-        self._lay_routes()
+        self._passage: Final[Passage] = passage if passage is not None else Passage(self.injectors)
+        self._from_controller: Final[list[Route | None]] = self._passage.from_controller
+        self._from_drives: Final[list[Route | None]] = self._passage.from_drives
+        for injector in injectors:
+            if injector.from_power_up:
+                self._power_up = NEVER
 
     @property
     def records(self) -> list[Activation]:
         """The activations so far, in the order they opened; all closed after `finish`."""
-        return list(self._records)
+        return list(self._passage.windows.records)
+
+    @property
+    def lost(self) -> list[int]:
+        """Frames that never go on because a fault said so, by port."""
+        return list(self._passage.lost)
+
+    @property
+    def inserted(self) -> list[int]:
+        """Frames that faults have added, by port."""
+        return list(self._passage.inserted)
+
+    @property
+    def waiting(self) -> int:
+        """Frames that faults have put off."""
+        return self._passage.waiting
 
     def receive(self, now: int, port: int, frame: Frame, out: Out) -> None:
         """Pass the frame to the other port, through the injectors that it is a target of."""
@@ -172,24 +161,21 @@ class Gateway(Node):
         if frame.flags == 0:
             route = self._from_drives[frame.can_id] if port else self._from_controller[frame.can_id]
             if route is not None:
-                if route.kind == _COMMAND and self._commands is not None:
-                    self._commands.command(now, frame, out)
-                    return
-                left = self._through(now, route, frame)
+                left = self._through(now, port, route, frame, out)
                 if left is None:
-                    self.lost[port] += 1
                     return
                 frame = left
-        if self._is_disturbed and not self._can_send(now, port, out):
-            self.undelivered[port] += 1
-            return
+        if self._is_disturbed:
+            self._came_in(now, port)
+            if not self._can_send(now, 1 - port):
+                self.undelivered[port] += 1
+                return
         out.send(1 - port, frame)
 
     def wake(self, now: int, out: Out) -> None:
-        """Open and close the windows that are due."""
-        self._advance(now)
-        if self._unreported:
-            self._report(out)
+        """Open and close the windows that are due, and send what faults have put off until now."""
+        self._passage.advance(now)
+        self._flush(now, out)
 
     def port_changed(self, now: int, state: PortState, out: Out) -> None:
         """Count the notice, note what changed, and stop or resume sending there."""
@@ -200,33 +186,31 @@ class Gateway(Node):
 
     def finish(self, now: int) -> None:
         """The run is over at `now`: close all windows; from now on every frame passes."""
-        self._advance(now - 1)
+        self._passage.advance(now - 1)
         for injector in self.injectors:
             injector.stop(now)
-        self._schedule()
+        self._passage.plan()
+        self._arrange(now)
 
     def settle(self, now: int) -> None:
         """Do all that is due up to and including `now`, after injectors were armed or disarmed from outside."""
-        self._schedule()
-        self._advance(now)
+        self._passage.settle(now)
+        self._arrange(now)
 
     def begin(self, time_zero: int) -> None:
-        """Time 0 is known: on the bus, or by live control where the master does not say it."""
+        """Time 0 is known: on the bus, or by live control where the master does not say it. `settle` follows."""
         self.time_zero = time_zero
         for injector in self.injectors:
             if not injector.from_power_up:
                 injector.start(time_zero)
-        self._schedule()
+        self._passage.plan()
+        self.wake_at = self._passage.next_ns
 
     def fire(self, injector: Injector, now: int) -> None:
         """Live control: open the window of an armed injector, with all that it triggers, at `now`."""
         self.settle(now)
-        for link in self._links:
-            link.fired = link.injector is injector
-        self._settle(now, None)
-        for link in self._links:
-            link.fired = False
-        self._schedule()
+        self._passage.windows.fire(injector, now)
+        self.settle(now)
 
     def add(self, injector: Injector, now: int, at_once: bool = False) -> None:
         """Live control: one more injector, behind the others, as if armed at `now`.
@@ -239,11 +223,9 @@ class Gateway(Node):
             raise FaultError(f"injector {name}: its target {commands.cob_id:#x} is the COB-ID of live control")
         if injector.from_power_up and not at_once and self._power_up != NEVER:
             raise FaultError(f"injector {name}: power-up is over; give it before the rig runs, or from: time_zero")
-        links = _links([*self.injectors, injector])
         self.settle(now - 1)
+        self._passage.add(injector)
         self.injectors.append(injector)
-        self._links[:] = links
-        self._lay_route(injector)
         base_ns = now if at_once else self.time_zero
         if base_ns != NEVER:
             enabled, injector.enabled = injector.enabled, False
@@ -261,123 +243,83 @@ class Gateway(Node):
                     "give another one for either"
                 )
         self._commands = commands
+        self._passage.windows.keeps_opened = True
         table = self._from_drives if commands.port == DRIVE_PORT else self._from_controller
-        table[commands.cob_id] = _Route(_COMMAND)
+        table[commands.cob_id] = Route(COMMAND)
 
-    def __reduce__(self) -> tuple[type["Gateway"], tuple[list[Injector], int], dict[str, object]]:
+    def __reduce__(self) -> tuple[type["Gateway"], tuple[list[Injector], int, Passage], dict[str, object]]:
         state = {name: getattr(self, name) for name in _STATE}
-        return Gateway, (self.injectors, self._cycle_ns), state
-
-    def _lay_routes(self) -> None:
-        """One route per COB-ID and direction that is not simply passed on."""
-        self._from_controller[SYNC] = _Route(_SYNC)
-        self._from_controller[HLC_STATUS] = _Route(_STATUS)
-        for injector in self.injectors:
-            self._lay_route(injector)
-        for injector in self.injectors:
-            if injector.from_power_up:  # until then every frame is looked at
-                for cob_id in range(0x800):
-                    _route(self._from_controller, cob_id)
-                    _route(self._from_drives, cob_id)
-                return
-        self._power_up = 0
-
-    def _lay_route(self, injector: Injector) -> None:
-        for cob_id in sorted(set(injector.target.cob_ids)):
-            if injector.target.to_drives:
-                _route(self._from_controller, cob_id).injectors.append(injector)
-            if injector.target.to_controller:
-                _route(self._from_drives, cob_id).injectors.append(injector)
+        return Gateway, (self.injectors, self._cycle_ns, self._passage), state
 
     def _power_on(self, now: int) -> None:
-        """The first frame: start the injectors that count from here, and free the routes that are not needed."""
+        """The first frame: start the injectors that count from here."""
         self._power_up = now
-        for table in (self._from_controller, self._from_drives):
-            for cob_id, route in enumerate(table):
-                if route is not None and route.kind == _PLAIN and not route.injectors:
-                    table[cob_id] = None
+        self._passage.free()
         for injector in self.injectors:
             if injector.from_power_up:
                 injector.start(now)
-        self._schedule()
+        self._passage.settle(now - 1)
 
-    def _through(self, now: int, route: _Route, frame: Frame) -> Frame | None:
-        """The frame after the injectors of its route; None: lost."""
+    def _through(self, now: int, port: int, route: Route, frame: Frame, out: Out) -> Frame | None:
+        """The frame after the injectors of its route; None: it does not go on now."""
+        passage = self._passage
         if self._power_up == NEVER:
             self._power_on(now)
-        if route.kind == _STATUS or (route.kind == _SYNC and self.time_zero == NEVER):
-            self._observe(now, route.kind, frame)
-        if now >= self.wake_at:
-            self._advance(now)
-        if self._waiting:
-            self._settle(now, route)
-            self._schedule()
-        for injector in route.injectors:
-            left: Frame | None = frame
-            if injector.phase is ACTIVE:
-                left = injector.act(now, frame)
-                if injector.counted:
-                    self._schedule()
-            if len(frame.data) >= injector.least_bytes:
-                injector.held[frame.can_id] = frame
-            if left is None:
+        if route.kind != PLAIN:
+            if route.kind == COMMAND:
+                if self._commands is not None:
+                    self._commands.command(now, frame, out)
                 return None
-            frame = left
-        return frame
+            self._observe(now, route.kind, frame)
+        if now >= passage.next_ns:
+            passage.advance(now)
+        if route.watchers or passage.windows.is_waiting:
+            passage.watch(now, port, route, frame)
+        left = passage.through(now, port, route.injectors, frame)
+        if passage.outbox or passage.windows.opened:
+            self._flush(now, out)
+        else:
+            self.wake_at = passage.next_ns
+        return left
 
     def _observe(self, now: int, kind: int, frame: Frame) -> None:
         """Look for time 0 in SYNC and status frames from the controller, then for the end of the motion."""
-        if kind == _SYNC:
+        if kind == SYNC_READ:
             self._last_sync = now
         elif len(frame.data) < 3:
             self.malformed += 1
         elif self.time_zero != NEVER:
             if frame.data[0] == STATUS_STOPPED:
-                self._advance(now - 1)
+                self._passage.advance(now - 1)
                 for injector in self.injectors:
                     if not injector.from_power_up:
                         injector.stop(now)
-                self._schedule()
+                self._passage.settle(now)
         elif frame.data[0] == STATUS_MOTION and now - self._last_sync < self._cycle_ns:
             cycle = frame.data[1] | frame.data[2] << 8
             self.begin(self._last_sync - cycle * self._cycle_ns)
+            self._passage.settle(now)
 
-    def _advance(self, now: int) -> None:
-        """Settle every instant up to and including `now` at which something is due, in order."""
-        while self.wake_at <= now:
-            self._settle(self.wake_at, None)
-            self._schedule()
+    def _arrange(self, now: int) -> None:
+        """Ask to be woken when there is something to do, or at once to say what could not be said without an `out`."""
+        passage = self._passage
+        self.wake_at = now if passage.outbox or passage.windows.opened else passage.next_ns
 
-    def _settle(self, now: int, route: _Route | None) -> None:
-        """Close and open windows at `now`, sources of triggers first. route: of the frame that arrives at `now`."""
-        for link in self._links:
-            injector = link.injector
-            link.opened = False
-            if injector.phase is ACTIVE and injector.next_ns <= now:
-                injector.close(injector.next_ns)
-            cause = ""
-            if injector.phase is ARMED:
-                cause = "event" if injector.next_ns <= now else _cause(link)
-            elif injector.phase is WAITING and route is not None and injector in route.injectors:
-                cause = "frame"
-            if cause:
-                opened = injector.open(now, cause)
-                if opened is not None:
-                    link.opened = True
-                    self._records.append(opened)
-                    if self._commands is not None:
-                        self._unreported.append(opened)
-                        self._is_disturbed = True
-
-    def _schedule(self) -> None:
-        """Note when something is due next, and whether an injector waits for a frame."""
-        self.wake_at = NEVER
-        self._waiting = False
-        for injector in self.injectors:
-            if injector.next_ns < self.wake_at:
-                self.wake_at = injector.next_ns
-            if injector.phase is WAITING:
-                self._waiting = True
+    def _flush(self, now: int, out: Out) -> None:
+        """Send what goes out besides the frame that has arrived, and say what has become active."""
+        passage = self._passage
+        if passage.windows.opened:
+            opened, passage.windows.opened = passage.windows.opened, []
+            if self._commands is not None:
+                self._commands.report(opened, out)
+        if passage.outbox:
+            outbox, passage.outbox = passage.outbox, []
+            for port, frame in outbox:
+                if self._is_disturbed and not self._can_send(now, port):
+                    self.undelivered[1 - port] += 1
+                else:
+                    out.send(port, frame)
+        self.wake_at = passage.next_ns
 
     def _change(self, now: int, port: int, state: ErrorState, cause: str) -> None:
         """A port has a new state."""
@@ -386,59 +328,18 @@ class Gateway(Node):
             self.port_changes.append(PortChange(now, port, state, cause))
         self._away[port] = state is ErrorState.BUS_OFF or state is ErrorState.DOWN
         self._probe_at[port] = now + _PROBE_NS
-        self._is_disturbed = self._away[0] or self._away[1] or len(self._unreported) > 0
-
-    def _can_send(self, now: int, port: int, out: Out) -> bool:
-        """Whether a frame that came in on `port` at `now` may go out on the other; says first what is unreported."""
-        if self._unreported:
-            self._report(out)
-        if self._away[port]:
-            self._change(now, port, ErrorState.ERROR_ACTIVE, "frame received")
-        other = 1 - port
-        if not self._away[other]:
-            return True
-        if now < self._probe_at[other]:
-            return False
-        self._probe_at[other] = now + _PROBE_NS
-        return True
-
-    def _report(self, out: Out) -> None:
-        """Say on the bus what has become active."""
-        if self._commands is not None:
-            self._commands.report(self._unreported, out)
-        self._unreported = []
         self._is_disturbed = self._away[0] or self._away[1]
 
+    def _came_in(self, now: int, port: int) -> None:
+        """A frame has come in: the port is there."""
+        if self._away[port]:
+            self._change(now, port, ErrorState.ERROR_ACTIVE, "frame received")
 
-def _route(table: list[_Route | None], cob_id: int) -> _Route:
-    """The route of that COB-ID, made when it is not there."""
-    route = table[cob_id]
-    if route is None:
-        route = _Route(_PLAIN)
-        table[cob_id] = route
-    return route
-
-
-def _links(injectors: list[Injector]) -> list[_Link]:
-    """The injectors in the order in which triggers settle, each with its sources."""
-    by_name: dict[str, _Link] = {}
-    links: list[_Link] = []
-    for injector in graph_order(injectors):
-        names = injector.trigger.any_of if injector.trigger is not None else ()
-        sources: list[_Link] = []
-        for name in names:
-            sources.append(by_name[name])
-        link = _Link(injector, sources)
-        by_name[injector.name] = link
-        links.append(link)
-    return links
-
-
-def _cause(link: _Link) -> str:
-    """What starts this injector at this instant besides its event, "" for nothing."""
-    if link.fired:
-        return "command"
-    for source in link.sources:
-        if source.opened:
-            return f"trigger:{source.injector.name}"
-    return ""
+    def _can_send(self, now: int, port: int) -> bool:
+        """Whether a frame may go out on `port` at `now`."""
+        if not self._away[port]:
+            return True
+        if now < self._probe_at[port]:
+            return False
+        self._probe_at[port] = now + _PROBE_NS
+        return True

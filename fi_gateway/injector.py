@@ -1,8 +1,7 @@
-"""Injectors: target + fault + event + effect (+ trigger), and the record of what each activation did.
+"""Injectors: target + fault + event + effect (+ trigger), each with its windows over time.
 
-Three counts are kept apart, as in fault-injection practice: activated (windows opened), injected (frames the fault
-acted on) and manifested (frames that really came out different, or not at all).
-Left out: `all` triggers, triggers on manifested and ended, delays and probabilities of triggers.
+The gateway tells an injector the time and shows it the frames; `windows` opens and closes it, `passage` carries out
+what its fault asks for.
 """
 
 import zlib
@@ -13,10 +12,14 @@ from numpy.random import PCG64, Generator, SeedSequence
 
 from canopen_exo.bus.frame import Frame
 from canopen_exo.bus.node import NEVER
+from fi_gateway.activation import Activation
 from fi_gateway.effects import Effect
 from fi_gateway.errors import FaultError
 from fi_gateway.events import Event
 from fi_gateway.faults import Fault
+from fi_gateway.outlet import Tray
+from fi_gateway.repair import Repair
+from fi_gateway.trigger import Report, Trigger
 
 
 class Phase(Enum):
@@ -35,30 +38,27 @@ WAITING: Final = Phase.WAITING
 ACTIVE: Final = Phase.ACTIVE
 SPENT: Final = Phase.SPENT
 
-_TRIGGER_ON: Final = ("activated",)
-
-_ACTIVATION_STATE: Final = (
-    "end_ns",
-    "frames_seen",
-    "frames_unfit",
-    "frames_injected",
-    "frames_changed",
-    "saturated",
-    "first_before",
-    "first_after",
-)
 _INJECTOR_STATE: Final = (
     "phase",
     "next_ns",
+    "wake_ns",
+    "end_ns",
     "held",
+    "lines",
+    "has_news",
+    "has_turned",
+    "has_manifested",
     "activated",
     "injected",
     "manifested",
+    "manifested_windows",
+    "ended",
     "too_short",
     "_base_ns",
     "_cause",
     "_due_ns",
     "_left",
+    "_port",
     "_current",
 )
 """What `__reduce__` copies besides the constructor arguments."""
@@ -86,59 +86,15 @@ class Target:
 
 
 @final
-class Trigger:
-    """Starts the injector when one of the named ones activates (`on: activated`), at the same instant."""
+class Line:
+    """Frames of one COB-ID that wait behind an injector in the order they came. at_ns: when the last one goes on."""
 
-    def __init__(self, any_of: tuple[str, ...], on: str = "activated") -> None:
-        if on not in _TRIGGER_ON:
-            raise FaultError(f"trigger: on {on!r} given, allowed: {', '.join(_TRIGGER_ON)}")
-        if not any_of:
-            raise FaultError("trigger: no injector named in any, allowed are one or more")
-        self.any_of: Final[tuple[str, ...]] = any_of
-        self.on: Final[str] = on
+    def __init__(self, at_ns: int) -> None:
+        self.at_ns: int = at_ns
+        self.waiting: int = 0
 
-    def __reduce__(self) -> tuple[type["Trigger"], tuple[tuple[str, ...], str]]:
-        return Trigger, (self.any_of, self.on)
-
-
-@final
-class Activation:
-    """One activation. Times in ns on the loop's clock.
-
-    injector, index: name, and number of the activation from 0; signal: "node.name", for whole frames the target's name;
-    cause: "event", "trigger:<name>" or "command"; due_ns: the time drawn, given, triggered or commanded;
-    start_ns: when the window opened, later than due_ns only when the fault had to wait for a value;
-    duration_ns: as drawn or given, NEVER for no limit;
-    end_ns: first instant outside the window, as planned until it closes; a window without limit keeps NEVER.
-    frames_seen: target frames that reached it; frames_unfit: of those, too short to act on; frames_injected: acted on
-    (a drop that spares a frame does not act on it); frames_changed: of those, changed or lost; saturated: values cut at
-    the signal's range; first_before, first_after: the first changed frame (first_after None: it was lost).
-    """
-
-    def __init__(
-        self, injector: str, index: int, signal: str, cause: str, due_ns: int, start_ns: int, duration_ns: int
-    ) -> None:
-        self.injector: Final[str] = injector
-        self.index: Final[int] = index
-        self.signal: Final[str] = signal
-        self.cause: Final[str] = cause
-        self.due_ns: Final[int] = due_ns
-        self.start_ns: Final[int] = start_ns
-        self.duration_ns: Final[int] = duration_ns
-        self.end_ns: int = min(start_ns + duration_ns, NEVER)
-        self.frames_seen: int = 0
-        self.frames_unfit: int = 0
-        self.frames_injected: int = 0
-        self.frames_changed: int = 0
-        self.saturated: int = 0
-        self.first_before: Frame | None = None
-        self.first_after: Frame | None = None
-
-    def __reduce__(
-        self,
-    ) -> tuple[type["Activation"], tuple[str, int, str, str, int, int, int], dict[str, object]]:
-        given = (self.injector, self.index, self.signal, self.cause, self.due_ns, self.start_ns, self.duration_ns)
-        return Activation, given, {name: getattr(self, name) for name in _ACTIVATION_STATE}
+    def __reduce__(self) -> tuple[type["Line"], tuple[int], dict[str, object]]:
+        return Line, (self.at_ns,), {"waiting": self.waiting}
 
 
 @final
@@ -151,9 +107,16 @@ class Injector:
 
     An event or trigger that comes while waiting or active is ignored. enabled False: never leaves inert until armed.
     from_power_up: its times count from power-up instead of time 0. rng: the stream of this injector alone (`stream`).
-    next_ns: when it acts by itself next (event, or end of the window), NEVER for not at all; held: the last frame of
-    each target COB-ID that reached it, if it had the least_bytes that the signal needs. counted: the effect ends after
-    a number of frames. too_short: frames that did not hold what the fault acts on.
+    rearms: whether it arms again after a window, None: as the effect says; max_activations: spent after so many, 0 for
+    no limit. repair: what is put right in a payload that the fault has changed. reports: what it says on the bus.
+    next_ns: when it acts by itself next (event, or end of the window), NEVER for not at all; wake_ns: when its fault
+    wants to be woken; end_ns: end of the last window that is over; held: the last frame of each target COB-ID that
+    reached it, if it had the least_bytes that the signal needs. number: its place in written order.
+    lines: frames that wait behind it, by COB-ID x 2 + port.
+    has_news: acting has left something to be carried out; has_turned: so that windows may open or close, or the fault
+    is woken at another time; has_manifested: the open window has;
+    manifested_windows, ended: windows that have manifested, that are over. too_short: frames that did not hold what the
+    fault acts on.
     """
 
     def __init__(
@@ -167,6 +130,10 @@ class Injector:
         rng: Generator,
         enabled: bool = True,
         from_power_up: bool = False,
+        rearms: bool | None = None,
+        max_activations: int = 0,
+        repair: Repair | None = None,
+        reports: tuple[Report, ...] = (),
     ) -> None:
         signal = fault.signal
         if signal is not None and target.cob_ids != (signal.cob_id,):
@@ -174,30 +141,56 @@ class Injector:
                 f"injector {name}: target COB-IDs {[hex(i) for i in target.cob_ids]} given for signal "
                 f"{signal.node}.{signal.name}, allowed is {[hex(signal.cob_id)]}, where it lies"
             )
+        if max_activations < 0:
+            raise FaultError(f"injector {name}: max_activations {max_activations} given, allowed 0 (no limit) and more")
         self.name: Final[str] = name
         self.target: Final[Target] = target
         self.trigger: Final[Trigger | None] = trigger
+        self.reports: Final[tuple[Report, ...]] = reports
         self.enabled: bool = enabled
         self.from_power_up: Final[bool] = from_power_up
-        self.counted: Final[bool] = effect.frames > 0
+        self.watches_target: Final[bool] = event.watches_target
         self.least_bytes: Final[int] = 0 if signal is None else (signal.start + signal.length + 7) // 8
+        self.number: int = 0
         self.phase: Phase = INERT
         self.next_ns: int = NEVER
+        self.wake_ns: int = NEVER
+        self.end_ns: int = -NEVER
         self.held: dict[int, Frame] = {}
+        self.lines: dict[int, Line] = {}
+        self.has_news: bool = False
+        self.has_turned: bool = False
+        self.has_manifested: bool = False
         self.activated: int = 0
         self.injected: int = 0
         self.manifested: int = 0
+        self.manifested_windows: int = 0
+        self.ended: int = 0
         self.too_short: int = 0
         self._signal: Final[str] = target.name if signal is None else f"{signal.node}.{signal.name}"
         self._fault: Final[Fault] = fault
         self._event: Final[Event] = event
         self._effect: Final[Effect] = effect
         self._rng: Final[Generator] = rng
+        self._given_rearms: Final[bool | None] = rearms
+        self._rearms: Final[bool] = effect.rearms if rearms is None else rearms
+        self._max_activations: Final[int] = max_activations
+        self._repair: Final[Repair | None] = repair
         self._base_ns: int = NEVER
         self._cause: str = ""
         self._due_ns: int = NEVER
         self._left: int = 0
+        self._port: int = 0 if target.to_drives else 1
         self._current: Activation | None = None
+
+    @property
+    def port(self) -> int:
+        """Where the last target frame came in; before one has, a side from which the target travels."""
+        return self._port
+
+    def watches(self) -> list[tuple[int, int]]:
+        """(port, COB-ID) of the frames that event and effect want to observe as they come in."""
+        return sorted({*self._event.watches, *self._effect.watches})
 
     def start(self, base_ns: int) -> None:
         """Time 0 (or power-up) is `base_ns`: arm."""
@@ -235,33 +228,92 @@ class Injector:
         )
         self.phase, self.next_ns, self._current = ACTIVE, opened.end_ns, opened
         self.activated += 1
+        self.has_manifested = False
+        self.wake_ns = self._fault.wake_at
         self._left = self._effect.frames
         return opened
 
-    def act(self, now: int, frame: Frame) -> Frame | None:
-        """What becomes of a target frame that arrives at `now` while active; None: lost."""
+    def observe(self, now: int, port: int, frame: Frame) -> bool:
+        """A frame of `watches` has come in; whether the window opens, or ends, with it."""
+        key, relative_ns = (port, frame.can_id), now - self._base_ns
+        starts = key in self._event.watches and self._event.observe(relative_ns, frame)
+        ends = key in self._effect.watches and self._effect.observe(relative_ns, frame)
+        return self._is_due(now, starts, ends)
+
+    def observe_target(self, now: int, frame: Frame) -> bool:
+        """A target frame has reached this injector, whose event looks at each; whether the window opens with it."""
+        return self._is_due(now, self._event.observe(now - self._base_ns, frame), False)
+
+    def act(self, now: int, port: int, frame: Frame, tray: Tray) -> Frame | None:
+        """What becomes of a target frame that arrives at `now` while active; None: lost, or later (in the tray)."""
         current = self._current
         if current is None or now < current.start_ns:  # stamped before the window, read after it opened
             return frame
         current.frames_seen += 1
-        if not self._fault.fits(frame):
+        fault = self._fault
+        if not fault.fits(frame):
             current.frames_unfit += 1
             self.too_short += 1
             return frame
-        result = self._fault.apply(now, frame)
-        if not (result is frame and self._fault.spares):
+        self._port = port
+        result = fault.apply(now, frame, tray)
+        if result is not frame or tray.used:
+            if self._repair is not None:
+                result = self._repaired(frame, result, tray)
             self.injected += 1
             current.frames_injected += 1
-        if result is not frame and result != frame:
-            self.manifested += 1
-            if current.frames_changed == 0:
-                current.first_before, current.first_after = frame, result
-            current.frames_changed += 1
+            if tray.used or result is None:
+                self._count_passage(current, frame, result, tray)
+            elif result != frame:
+                self.manifested += 1
+                current.frames_changed += 1
+                if not self.has_manifested:
+                    self._first(current, frame, result)
+        elif not fault.spares:
+            self.injected += 1
+            current.frames_injected += 1
+        if fault.wake_at != self.wake_ns:
+            self.wake_ns, self.has_news, self.has_turned = fault.wake_at, True, True
         if self._left:
             self._left -= 1
             if self._left == 0:
                 self.close(now + 1)
+                self.has_news = self.has_turned = True
         return result
+
+    def wake(self, now: int, tray: Tray) -> None:
+        """The time that the fault asked for has come. Raises FaultError for one that asks for it again."""
+        current, fault = self._current, self._fault
+        if current is None:
+            return
+        fault.wake(now, tray)
+        if fault.wake_at <= now:
+            raise FaultError(
+                f"injector {self.name}: its fault {type(fault).__name__} asks to be woken at {fault.wake_at} ns again, "
+                f"it is {now} ns; wake() must move wake_at on"
+            )
+        self.wake_ns = fault.wake_at
+        if not tray.used:
+            return
+        if self._repair is not None:
+            self._repaired(None, None, tray)
+        count = len(tray.inserted) + len(tray.late)
+        self.manifested += count
+        current.frames_inserted += count
+        if not self.has_manifested:
+            self._first(current, None, tray.inserted[0] if tray.inserted else tray.late[0].frame)
+        self.has_news = True
+
+    def count_wait(self, arrived: Frame, left: Frame) -> None:
+        """A frame has to wait behind others here; one that the fault has left alone is delayed by that."""
+        current = self._current
+        if current is not None and left is arrived:
+            self.manifested += 1
+            current.frames_delayed += 1
+
+    def draw(self) -> float:
+        """For its trigger: a number 0..1 of its own stream."""
+        return float(self._rng.random())
 
     def close(self, end_ns: int) -> None:
         """The window ends; `end_ns` is the first instant outside it."""
@@ -272,7 +324,11 @@ class Injector:
         current.end_ns = end_ns
         current.saturated = self._fault.saturated
         self._current = None
-        if self._effect.rearms:
+        self.has_manifested = False
+        self.wake_ns = NEVER
+        self.end_ns = end_ns
+        self.ended += 1
+        if self._rearms and (self._max_activations == 0 or self.activated < self._max_activations):
             self._arm(self._event.next(end_ns - self._base_ns))
         else:
             self.phase, self.next_ns = SPENT, NEVER
@@ -288,46 +344,54 @@ class Injector:
     def __reduce__(self) -> tuple[type["Injector"], tuple[object, ...], dict[str, object]]:
         given = (self.name, self.target, self._fault, self._event, self._effect, self.trigger, self._rng)
         state = {name: getattr(self, name) for name in _INJECTOR_STATE}
-        return Injector, (*given, self.enabled, self.from_power_up), state
+        more = (self._given_rearms, self._max_activations, self._repair, self.reports)
+        return Injector, (*given, self.enabled, self.from_power_up, *more), state
 
     def _arm(self, relative_ns: int) -> None:
         self.phase = ARMED
         self.next_ns = NEVER if relative_ns >= NEVER else min(self._base_ns + relative_ns, NEVER)
 
+    def _is_due(self, now: int, starts: bool, ends: bool) -> bool:
+        """Note that the window opens, or ends, at `now`; whether it does."""
+        if (starts and self.phase is ARMED) or (ends and self.phase is ACTIVE):
+            self.next_ns = now if now < self.next_ns else self.next_ns
+            return True
+        return False
 
-def graph_order(injectors: list[Injector]) -> list[Injector]:
-    """The injectors with every trigger's source before those it starts, otherwise as written.
+    def _count_passage(self, current: Activation, frame: Frame, result: Frame | None, tray: Tray) -> None:
+        """Count a frame that is lost, late, or did not stay alone."""
+        later, inserted = len(tray.late), len(tray.inserted)
+        if result is None and later:
+            later -= 1
+            current.frames_delayed += 1
+        elif result is None:
+            current.frames_lost += 1
+        elif result != frame:
+            current.frames_changed += 1
+        self.manifested += later + inserted + (1 if result is None or result != frame else 0)
+        current.frames_inserted += later + inserted
+        if not self.has_manifested:
+            after = result
+            if result is None and tray.late:
+                after = tray.late[0].frame
+            elif result is not None and result == frame:
+                after = tray.inserted[0] if tray.inserted else tray.late[0].frame
+            self._first(current, frame, after)
+        if tray.used:
+            self.has_news = True
 
-    Raises FaultError for a name that is there twice, a trigger that names no injector, and a cycle (printed).
-    """
-    by_name: dict[str, Injector] = {}
-    for injector in injectors:
-        if injector.name in by_name:
-            raise FaultError(f"injector {injector.name}: the name is given twice, every injector needs its own")
-        by_name[injector.name] = injector
-    order: list[Injector] = []
-    for injector in injectors:
-        _visit(injector, by_name, order, [])
-    return order
+    def _first(self, current: Activation, before: Frame | None, after: Frame | None) -> None:
+        """The window has manifested."""
+        current.first_before, current.first_after = before, after
+        self.has_manifested = True
+        self.manifested_windows += 1
+        self.has_news = self.has_turned = True
 
-
-def _visit(injector: Injector, by_name: dict[str, Injector], order: list[Injector], path: list[str]) -> None:
-    """Append what starts `injector`, then itself. path: the injectors that wait for this one."""
-    if injector.name in path:
-        cycle = [*path[path.index(injector.name) :], injector.name]
-        cycle.reverse()
-        raise FaultError(f"injector {injector.name}: its trigger leads back to itself: {' -> '.join(cycle)}")
-    if injector in order:
-        return
-    path.append(injector.name)
-    for name in injector.trigger.any_of if injector.trigger is not None else ():
-        if name not in by_name:
-            raise FaultError(
-                f"injector {injector.name}: trigger names {name!r}, allowed are {', '.join(sorted(by_name))}"
-            )
-        _visit(by_name[name], by_name, order, path)
-    path.pop()
-    order.append(injector)
+    def _repaired(self, frame: Frame | None, result: Frame | None, tray: Tray) -> Frame | None:
+        """What the fault made of `frame`, with checksum and counter put right where its payload is another one."""
+        assert self._repair is not None
+        tray.repair(self._repair, frame)
+        return None if result is None else self._repair.frame(frame, result)
 
 
 def stream(seed: int, run: int, name: str) -> Generator:

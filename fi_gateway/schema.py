@@ -1,41 +1,34 @@
 """The `injectors:` part of a scenario: read, checked against the rig, said in words, and built.
 
 Sources: the terms are FIBlock's (Fabarisov et al., ESREL 2020): fault (type), event (when), effect (how long), trigger.
-Left out: triggers with `all`, on manifested or ended, with delay or probability; `rearm`, `max_activations`.
 """
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 from numpy.random import Generator
 from pydantic import Field
 
 from canopen_exo.plan import BusPlan
-from fi_gateway.boundary import Flag, Later, SpecError, SpecModel, Text, validate
+from fi_gateway.boundary import Count, Flag, SpecError, SpecModel, validate
+from fi_gateway.chain import draw_chains
+from fi_gateway.effect_specs import InfiniteSpec
 from fi_gateway.errors import FaultError
-from fi_gateway.fault_specs import FaultChoice, FaultSpec
-from fi_gateway.injector import Injector, Target, Trigger, stream
+from fi_gateway.fault_specs import FaultChoice
+from fi_gateway.injector import Injector, Target, stream
 from fi_gateway.marked_yaml import Data, Keys, did_you_mean, dotted
 from fi_gateway.target import TargetSpec, resolve
 from fi_gateway.timing_specs import EffectChoice, EventChoice, Timing
-
-
-@dataclass(frozen=True, slots=True)
-class TriggerSpec(SpecModel):
-    """`trigger:` of an injector: it also starts when any of the named ones activates."""
-
-    later: ClassVar[tuple[str, ...]] = ("all", "edge", "delay", "probability")
-
-    any: Annotated[tuple[Text, ...], Field(min_length=1)]
-    on: Annotated[Literal["activated"], Later(("manifested", "ended"))] = "activated"
+from fi_gateway.trigger_specs import RepairSpec, ReportSpec, TriggerSpec
 
 
 @dataclass(frozen=True, slots=True)
 class InjectorSpec(SpecModel):
-    """One injector. start: its times count from time 0 of the motion, or from power-up (key `from`)."""
+    """One injector. start: its times count from time 0 of the motion, or from power-up (key `from`).
 
-    later: ClassVar[tuple[str, ...]] = ("rearm", "max_activations")
+    rearm: whether it waits again after a window, by default as the effect says; max_activations: then it is spent.
+    """
 
     target: TargetSpec
     fault: FaultChoice
@@ -44,13 +37,31 @@ class InjectorSpec(SpecModel):
     trigger: TriggerSpec | None = None
     enabled: Flag = True
     start: Annotated[Literal["time_zero", "power_up"], Field(alias="from")] = "time_zero"
+    rearm: Flag | None = None
+    max_activations: Count | None = None
+    repair: RepairSpec | None = None
+    report: ReportSpec | None = None
+
+    def __post_init__(self) -> None:
+        """The keys about the number of windows agree; raises ValueError."""
+        most = self.max_activations
+        if self.rearm is False and most is not None and most > 1:
+            raise ValueError(f"rearm: false allows one activation, max_activations {most}; leave one of them out")
+        if self.rearm is True and most == 1:
+            raise ValueError("max_activations: 1 leaves nothing to rearm for; leave one of them out")
+        if isinstance(self.effect, InfiniteSpec) and (self.rearm or (most is not None and most > 1)):
+            raise ValueError("an infinite effect never ends, so that nothing comes after it; give another effect")
+
+    def rearms(self) -> bool | None:
+        """As the engine takes it; None: as the effect says."""
+        return True if self.rearm is None and (self.max_activations or 0) > 1 else self.rearm
 
     def timing(self) -> Timing:
         """Event and effect together."""
-        return Timing(self.event, self.effect)
+        return Timing(self.event, self.effect, self.rearms(), self.max_activations or 0)
 
 
-Report = Callable[[Keys, str], None]
+Complain = Callable[[Keys, str], None]
 """Takes a complaint: where, counted from `injectors`, and what."""
 
 
@@ -61,11 +72,12 @@ class _Parts(SpecModel):
     target: TargetSpec | None = None
     fault: FaultChoice | None = None
     trigger: TriggerSpec | None = None
+    repair: RepairSpec | None = None
     event: EventChoice | None = None
     effect: EffectChoice | None = None
 
 
-def check_injectors(injectors: Mapping[str, Data], plan: BusPlan, report: Report) -> None:
+def check_injectors(injectors: Mapping[str, Data], plan: BusPlan, report: Complain) -> None:
     """Report what cannot work in injectors as read from a file, also where only parts of them can be read.
 
     What cannot be read is not reported: that is done by whoever reads them whole.
@@ -73,45 +85,50 @@ def check_injectors(injectors: Mapping[str, Data], plan: BusPlan, report: Report
     parts = {}
     for name, given in injectors.items():
         found = given if isinstance(given, dict) else {}
-        keys = ("target", "fault", "trigger", "event", "effect")
+        keys = ("target", "fault", "trigger", "repair", "event", "effect")
         read = [validate(_Parts, {key: found.get(key)}, (), None) or _Parts() for key in keys]
-        parts[name] = _Parts(read[0].target, read[1].fault, read[2].trigger, read[3].event, read[4].effect)
+        parts[name] = _Parts(
+            read[0].target, read[1].fault, read[2].trigger, read[3].repair, read[4].event, read[5].effect
+        )
     _check(parts, plan, report)
 
 
-def _check(parts: Mapping[str, _Parts], plan: BusPlan, report: Report) -> None:
-    triggers = {name: part.trigger.any for name, part in parts.items() if part.trigger is not None}
+def _check(parts: Mapping[str, _Parts], plan: BusPlan, report: Complain) -> None:
+    triggers = {name: part.trigger for name, part in parts.items() if part.trigger is not None}
     for name, part in parts.items():
         if part.target is not None:
-            _check_place(name, part.target, part.fault, plan, report)
+            _check_place(name, part.target, part, plan, report)
         for key, timed in (("event", part.event), ("effect", part.effect)):
             if timed is not None:
                 _check_timed(name, key, timed, plan, report)
-    for name, sources in triggers.items():
+    for name, trigger in triggers.items():
+        sources = trigger.sources
         for number, source in enumerate(sources):
             if source not in parts:
                 text = f"no injector is called {source!r}{did_you_mean(source, parts)} (there are {', '.join(parts)})"
-                report((name, "trigger", "any", number), text)
+                report((name, "trigger", trigger.key, number), text)
             elif source in sources[:number]:
-                report((name, "trigger", "any", number), f"{source!r} is named twice")
-    for cycle in _cycles(triggers):
-        report((cycle[0], "trigger", "any"), f"triggers go round in a circle: {' -> '.join((*cycle, cycle[0]))}")
+                report((name, "trigger", trigger.key, number), f"{source!r} is named twice")
+    for cycle in _cycles({name: trigger.sources for name, trigger in triggers.items()}):
+        keys = (cycle[0], "trigger", triggers[cycle[0]].key)
+        report(keys, f"triggers go round in a circle: {' -> '.join((*cycle, cycle[0]))}")
 
 
-def _check_place(name: str, target: TargetSpec, fault: FaultSpec | None, plan: BusPlan, report: Report) -> None:
+def _check_place(name: str, target: TargetSpec, part: _Parts, plan: BusPlan, report: Complain) -> None:
     try:
         place = resolve(target, plan)
     except SpecError as error:
         report((name, "target", *error.keys), str(error))
         return
-    try:
-        if fault is not None:
-            fault.build(place)
-    except SpecError as error:
-        report((name, "fault", *error.keys), str(error))
+    for key, spec in (("fault", part.fault), ("repair", part.repair)):
+        try:
+            if spec is not None:
+                spec.build(place)
+        except SpecError as error:
+            report((name, key, *error.keys), str(error))
 
 
-def _check_timed(name: str, key: str, timed: EventChoice | EffectChoice, plan: BusPlan, report: Report) -> None:
+def _check_timed(name: str, key: str, timed: EventChoice | EffectChoice, plan: BusPlan, report: Complain) -> None:
     try:
         timed.build(plan, stream(0, 0, name))
     except SpecError as error:
@@ -165,7 +182,8 @@ def injector_warnings(specs: Mapping[str, InjectorSpec], plan: BusPlan, duration
             for key, text in spec.timing().warnings(place, plan, duration_ns):
                 warnings.append(f"injectors.{name}.{key}: {text}")
         if not place.known:
-            warnings.append(f"injectors.{name}.target.cob_id: nothing in this rig sends {spec.target.cob_id:#x}")
+            cob_ids = place.name.removeprefix("frames ")
+            warnings.append(f"injectors.{name}.target.cob_id: nothing in this rig sends {cob_ids}")
     return warnings
 
 
@@ -179,14 +197,24 @@ def _live(specs: Mapping[str, InjectorSpec], plan: BusPlan, duration_ns: int) ->
             live.add(name)
     for _ in specs:
         for name, spec in specs.items():
-            if spec.enabled and spec.trigger is not None and not live.isdisjoint(spec.trigger.any):
+            if spec.enabled and spec.trigger is not None and _can_trigger(spec.trigger, live):
                 live.add(name)
     return live
 
 
+def _can_trigger(trigger: TriggerSpec, live: set[str]) -> bool:
+    if trigger.probability == 0:
+        return False
+    if trigger.all is not None:
+        return live.issuperset(trigger.all)
+    return trigger.frame is not None or not live.isdisjoint(trigger.sources)
+
+
 def describe_injectors(specs: Mapping[str, InjectorSpec], plan: BusPlan, duration_ns: int) -> list[str]:
-    """One sentence per injector, for a motion of that length [ns]."""
-    return [_sentence(name, spec, plan, duration_ns) for name, spec in specs.items()]
+    """One sentence per injector, for a motion of that length [ns]; then who starts whom, drawn."""
+    chains = draw_chains({name: spec.trigger for name, spec in specs.items() if spec.trigger is not None})
+    lines = [_sentence(name, spec, plan, duration_ns) for name, spec in specs.items()]
+    return [*lines, "triggers:", *(f"  {line}" for line in chains)] if chains else lines
 
 
 def _sentence(name: str, spec: InjectorSpec, plan: BusPlan, duration_ns: int) -> str:
@@ -196,17 +224,30 @@ def _sentence(name: str, spec: InjectorSpec, plan: BusPlan, duration_ns: int) ->
     if event:
         starts.append(event + (" after power-up" if spec.start == "power_up" else ""))
     if spec.trigger is not None:
-        starts.append(f"when {' or '.join(spec.trigger.any)} is activated")
+        starts.append(spec.trigger.words())
     when = f"starts {', and '.join(starts)}" if starts else "never starts"
     off = "" if spec.enabled else " (switched off)"
-    return f"{name}{off}: {place.words} {spec.fault.words(place)} {spec.effect.words()}; {when}"
+    more = "".join(f"; {part.words()}" for part in (spec.repair, spec.report) if part is not None)
+    return f"{name}{off}: {place.words} {spec.fault.words(place)} {_how_long(spec)}; {when}{more}"
+
+
+def _how_long(spec: InjectorSpec) -> str:
+    """The effect, and how often."""
+    words, most = spec.effect.words(), spec.max_activations
+    if spec.rearm is None and most is None:
+        return words
+    often = "once a run" if spec.rearm is False or most == 1 else "again and again"
+    if most is not None and most > 1:
+        often = f"at most {most} times a run"
+    return f"{words.removesuffix(', once a run')}, {often}"
 
 
 def build_injectors(specs: Mapping[str, InjectorSpec], plan: BusPlan, seed: int, run: int) -> list[Injector]:
     """The engine's injectors in written order, each with its own random stream; raises FaultError for bad specs."""
     problems: list[str] = []
     parts = {
-        name: _Parts(spec.target, spec.fault, spec.trigger, spec.event, spec.effect) for name, spec in specs.items()
+        name: _Parts(spec.target, spec.fault, spec.trigger, spec.repair, spec.event, spec.effect)
+        for name, spec in specs.items()
     }
     _check(parts, plan, lambda keys, text: problems.append(f"{dotted(('injectors', *keys))}: {text}"))
     if problems:
@@ -222,8 +263,12 @@ def _build(name: str, spec: InjectorSpec, plan: BusPlan, rng: Generator) -> Inje
         spec.fault.build(place),
         spec.event.build(plan, rng),
         spec.effect.build(plan, rng),
-        Trigger(spec.trigger.any, spec.trigger.on) if spec.trigger is not None else None,
+        spec.trigger.build() if spec.trigger is not None else None,
         rng,
         spec.enabled,
         spec.start == "power_up",
+        spec.rearms(),
+        spec.max_activations or 0,
+        spec.repair.build(place) if spec.repair is not None else None,
+        (spec.report.build(),) if spec.report is not None else (),
     )

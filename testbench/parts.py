@@ -23,7 +23,7 @@ from canopen_exo.bus.frame import Frame
 from canopen_exo.bus.lateness import Lateness, LatenessDocument
 from canopen_exo.bus.medium import Transmission
 from canopen_exo.errors import CanopenExoError
-from fi_gateway.injector import Activation
+from fi_gateway.activation import Activation
 from testbench.errors import BenchError
 from testbench.record import Array
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canopen_exo.bus.medium import Transmission
-from fi_gateway.injector import Activation
+from fi_gateway.activation import Activation
 from testbench.errors import BenchError
 
 Array = NDArray[np.float64]

@@ -16,7 +16,7 @@ from canopen_exo.bus.frame import Frame
 from canopen_exo.bus.lateness import LatenessDocument
 from canopen_exo.bus.node import NEVER
 from canopen_exo.bus.trace import candump_frame, trace_hash
-from fi_gateway.injector import Activation
+from fi_gateway.activation import Activation
 from testbench.errors import BenchError
 from testbench.golden import JointComparison
 from testbench.record import RunRecord
@@ -45,8 +45,9 @@ class InjectionEntry(TypedDict):
     """One activation.
 
     due_s: time drawn, given or triggered; start_s: when the window opened, later only when a value had to come first;
-    end_s: None when its window had no end; frames: changed or lost, of frames_seen target frames; frames_unfit: too
-    short to act on; saturated: values cut at the signal's range; first_*: as in a candump log.
+    duration_s: as drawn or given, None for no limit; end_s: None when its window had no end; frames: changed, lost,
+    delayed or inserted, and each of these; frames_injected: that the fault acted on, of frames_seen target frames;
+    frames_unfit: too short to act on; saturated: values cut at the signal's range; first_*: as in a candump log.
     """
 
     injector: str
@@ -54,7 +55,13 @@ class InjectionEntry(TypedDict):
     due_s: float
     start_s: float
     end_s: float | None
+    duration_s: float | None
     frames: int
+    frames_changed: int
+    frames_lost: int
+    frames_delayed: int
+    frames_inserted: int
+    frames_injected: int
     frames_seen: int
     frames_unfit: int
     saturated: int
@@ -65,7 +72,7 @@ class InjectionEntry(TypedDict):
 
 
 class CountEntry(TypedDict):
-    """activated: windows opened; injected: frames the fault acted on; manifested: of those, changed or lost."""
+    """activated: windows opened; injected: frames faults acted on; manifested: changed, lost, delayed or inserted."""
 
     activated: int
     injected: int
@@ -278,7 +285,7 @@ def _counts(activations: Sequence[Activation]) -> CountEntry:
     return {
         "activated": len(activations),
         "injected": sum(one.frames_injected for one in activations),
-        "manifested": sum(one.frames_changed for one in activations),
+        "manifested": sum(one.manifested for one in activations),
     }
 
 
@@ -289,7 +296,13 @@ def _injection(one: Activation, time0_ns: int) -> InjectionEntry:
         "due_s": (one.due_ns - time0_ns) / 1e9,
         "start_s": (one.start_ns - time0_ns) / 1e9,
         "end_s": None if one.end_ns >= NEVER else (one.end_ns - time0_ns) / 1e9,
-        "frames": one.frames_changed,
+        "duration_s": None if one.duration_ns >= NEVER else one.duration_ns / 1e9,
+        "frames": one.manifested,
+        "frames_changed": one.frames_changed,
+        "frames_lost": one.frames_lost,
+        "frames_delayed": one.frames_delayed,
+        "frames_inserted": one.frames_inserted,
+        "frames_injected": one.frames_injected,
         "frames_seen": one.frames_seen,
         "frames_unfit": one.frames_unfit,
         "saturated": one.saturated,
@@ -399,13 +412,21 @@ def _injection_lines(document: Summary) -> list[str]:
     lines = []
     for one in injections:
         end = "   to the end" if one["end_s"] is None else f"..{one['end_s']:8.3f} s "
-        what = "lost" if one["first_before"] is not None and one["first_after"] is None else "changed"
+        what = _what(one)
         cut = f", {one['saturated']} cut at the range" if one["saturated"] else ""
         lines.append(
             f"  {one['injector']:<{name}}  {one['signal'] or 'whole frame':<{signal}}  {one['start_s']:8.3f} {end}"
             f"  {one['frames']:5d} of {one['frames_seen']} frames {what}{cut}  {one['cause']}"
         )
     return [f"injections: {counts['activated']} activated, {counts['manifested']} of {seen} frames hit", *lines]
+
+
+def _what(one: InjectionEntry) -> str:
+    """What became of the frames, in one word."""
+    words = ("changed", "lost", "delayed", "inserted")
+    counts = (one["frames_changed"], one["frames_lost"], one["frames_delayed"], one["frames_inserted"])
+    happened = [word for word, count in zip(words, counts, strict=True) if count]
+    return "changed" if not happened else happened[0] if len(happened) == 1 else "hit"
 
 
 def _joint_lines(document: Summary) -> list[str]:

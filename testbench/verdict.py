@@ -153,7 +153,7 @@ def _outcome(
         return "error"
     if not faulted.activations:
         return "not_activated"
-    return "masked" if any(one.frames_changed for one in faulted.activations) else "not_manifested"
+    return "masked" if any(one.manifested for one in faulted.activations) else "not_manifested"
 
 
 def limit_errors(

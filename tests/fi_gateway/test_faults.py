@@ -15,6 +15,7 @@ from canopen_exo.bus.frame import FLAG_EXTENDED, Frame
 from canopen_exo.signal import Signal
 from fi_gateway.errors import FaultError
 from fi_gateway.faults import Bias, BitFlip, Drop, Fault, StuckAt, StuckAtPayload, StuckAtValue, distinct_bits
+from fi_gateway.outlet import Tray
 
 POSITION = Signal("position", "right_knee", "right_knee_TPDO1", 0x185, 0, 32, True, 1.0, "rad", 0x6064, 0)
 VELOCITY = Signal("velocity", "right_knee", "right_knee_TPDO1", 0x185, 32, 32, True, 1.0, "rad/s", 0x606C, 0)
@@ -49,14 +50,14 @@ def word(frame: Frame | None) -> int:
 def test_stuck_at_holds_the_last_value_and_leaves_the_rest() -> None:
     """faults.md: stuck_at gives the last correct value before activation; other signals pass."""
     fault = begun(StuckAt(POSITION), joint(-1000, 5))
-    assert values(fault.apply(0, joint(2000, 7))) == (-1000, 7)
-    assert values(fault.apply(1, joint(3000, 8))) == (-1000, 8)
+    assert values(fault.apply(0, joint(2000, 7), Tray())) == (-1000, 7)
+    assert values(fault.apply(1, joint(3000, 8), Tray())) == (-1000, 8)
 
 
 def test_stuck_at_passes_the_identical_frame_when_the_value_has_not_moved() -> None:
     """A frame that does not change is no manifestation."""
     fault, frame = begun(StuckAt(POSITION), joint(-1000, 5)), joint(-1000, 6)
-    assert fault.apply(0, frame) is frame
+    assert fault.apply(0, frame, Tray()) is frame
 
 
 @pytest.mark.parametrize("signal", [POSITION, None])
@@ -71,11 +72,11 @@ def test_stuck_at_payload_holds_each_cob_id_by_itself() -> None:
     """A payload is held per COB-ID; one seen for the first time is held from then on."""
     fault = StuckAt(None)
     assert fault.begin(0, {0x185: joint(1, 2), 0x186: Frame(0x186, b"\xaa")}, rng())
-    assert values(fault.apply(1, joint(8, 9))) == (1, 2)
-    assert fault.apply(1, Frame(0x186, b"\xbb")) == Frame(0x186, b"\xaa")
+    assert values(fault.apply(1, joint(8, 9), Tray())) == (1, 2)
+    assert fault.apply(1, Frame(0x186, b"\xbb"), Tray()) == Frame(0x186, b"\xaa")
     late = Frame(0x187, b"\x01")
-    assert fault.apply(1, late) is late
-    assert fault.apply(2, Frame(0x187, b"\x02")) == late
+    assert fault.apply(1, late, Tray()) is late
+    assert fault.apply(2, Frame(0x187, b"\x02"), Tray()) == late
 
 
 @pytest.mark.parametrize(("length", "fits"), [(0, False), (7, False), (8, True)])
@@ -93,8 +94,8 @@ def test_stuck_at_payload_forgets_when_the_activation_ends() -> None:
 
 def test_stuck_at_value_gives_the_value_and_leaves_the_rest() -> None:
     """faults.md: stuck_at_value gives a given value."""
-    assert values(begun(StuckAtValue(VELOCITY, 0)).apply(0, joint(5, 99))) == (5, 0)
-    assert values(begun(StuckAtValue(VELOCITY, -7)).apply(0, joint(5, 99))) == (5, -7)
+    assert values(begun(StuckAtValue(VELOCITY, 0)).apply(0, joint(5, 99), Tray())) == (5, 0)
+    assert values(begun(StuckAtValue(VELOCITY, -7)).apply(0, joint(5, 99), Tray())) == (5, -7)
 
 
 @pytest.mark.parametrize(
@@ -122,7 +123,7 @@ def test_stuck_at_value_is_refused_outside_the_range_of_the_signal(signal: Signa
 def test_stuck_at_payload_gives_the_payload_to_frames_of_its_length() -> None:
     """stuck_at_value without a signal: the whole payload."""
     fault = begun(StuckAtPayload(bytes(8)))
-    assert fault.apply(0, joint(5, 99)) == joint(0, 0)
+    assert fault.apply(0, joint(5, 99), Tray()) == joint(0, 0)
     assert [fault.fits(Frame(0x185, bytes(n))) for n in (0, 7, 8)] == [False, False, True]
     with pytest.raises(FaultError, match=r"9 bytes given, allowed 0\.\.8"):
         StuckAtPayload(bytes(9))
@@ -152,7 +153,7 @@ def test_bias_adds_and_saturates_at_the_range(
     """faults.md: value + bias; values that no longer fit saturate, nothing wraps."""
     fault = begun(Bias(signal, offset))
     frame = Frame(signal.cob_id, signal.write(b"\xa5" * 8, value))
-    result = fault.apply(0, frame)
+    result = fault.apply(0, frame, Tray())
     assert result is not None
     assert signal.read(result.data) == out
     mask = ((1 << signal.length) - 1) << signal.start
@@ -164,7 +165,7 @@ def test_saturation_is_counted_per_activation() -> None:
     """faults.md: they say so; the count starts anew with each activation."""
     fault = begun(Bias(WORD, 1))
     for _ in range(3):
-        fault.apply(0, Frame(0x285, b"\xff\xff"))
+        fault.apply(0, Frame(0x285, b"\xff\xff"), Tray())
     assert fault.saturated == 3
     begun(fault)
     assert fault.saturated == 0
@@ -174,13 +175,13 @@ def test_saturation_is_counted_per_activation() -> None:
 def test_drop_with_certainty(probability: float, lost: int) -> None:
     """faults.md: the frame is lost with probability p."""
     fault, frame = begun(Drop(probability)), joint(1, 2)
-    assert [fault.apply(n, frame) for n in range(200)].count(None) == lost
+    assert [fault.apply(n, frame, Tray()) for n in range(200)].count(None) == lost
 
 
 def test_drop_follows_the_binomial_distribution() -> None:
     """P(lost) = p, tested two-sided at 1 % with a fixed seed."""
     fault, frame = begun(Drop(0.3)), joint(1, 2)
-    results = [fault.apply(n, frame) for n in range(5000)]
+    results = [fault.apply(n, frame, Tray()) for n in range(5000)]
     assert all(result is None or result is frame for result in results)
     assert stats.binomtest(results.count(None), 5000, 0.3).pvalue > 0.01
 
@@ -198,7 +199,7 @@ def test_bit_flip_inverts_exactly_n_distinct_bits_of_the_signal(
 ) -> None:
     """faults.md: n distinct random bits inverted; none outside the signal."""
     fault, frame = begun(BitFlip(ODD, count, None, fixed), seed=seed), Frame(0x185, data)
-    changed = word(fault.apply(0, frame)) ^ word(frame)
+    changed = word(fault.apply(0, frame, Tray())) ^ word(frame)
     assert changed.bit_count() == count
     assert changed & ~(0x7FF << 13) == 0
 
@@ -210,7 +211,7 @@ def test_bit_flip_on_a_payload_stays_inside_it(data: bytes, more: st.DataObject)
     frame = Frame(0x185, data)
     fault = begun(BitFlip(None, count))
     assert fault.fits(frame)
-    result = fault.apply(0, frame)
+    result = fault.apply(0, frame, Tray())
     assert result is not None
     assert len(result.data) == len(data)
     assert (word(result) ^ word(frame)).bit_count() == count
@@ -221,29 +222,29 @@ def test_bit_flip_of_the_same_bits_twice_gives_the_frame_back(fault: BitFlip) ->
     """out = in XOR mask is its own inverse."""
     frame = joint(123456, -98765)
     begun(fault)
-    once = fault.apply(0, frame)
+    once = fault.apply(0, frame, Tray())
     assert once is not None
     assert once != frame
-    assert fault.apply(1, once) == frame
+    assert fault.apply(1, once, Tray()) == frame
 
 
 def test_given_bits_count_from_the_lowest_bit_of_the_signal() -> None:
     """Bit 31 of a signed 32-bit count is its sign."""
     fault = begun(BitFlip(VELOCITY, 1, (31,)))
-    assert values(fault.apply(0, joint(5, 0))) == (5, -(2**31))
-    assert word(begun(BitFlip(None, 1, (0, 63))).apply(0, joint(0, 0))) == 1 | 1 << 63
+    assert values(fault.apply(0, joint(5, 0), Tray())) == (5, -(2**31))
+    assert word(begun(BitFlip(None, 1, (0, 63))).apply(0, joint(0, 0), Tray())) == 1 | 1 << 63
 
 
 def test_bit_flip_takes_new_bits_for_every_frame_unless_fixed() -> None:
     """faults.md: bit_flip takes new bits for every frame unless fixed, which lasts for one activation."""
     frame = joint(0, 0)
     free, fixed = begun(BitFlip(POSITION, 1)), begun(BitFlip(POSITION, 1, None, True))
-    assert len({word(free.apply(n, frame)) for n in range(50)}) > 10
-    assert len({word(fixed.apply(n, frame)) for n in range(50)}) == 1
+    assert len({word(free.apply(n, frame, Tray())) for n in range(50)}) > 10
+    assert len({word(fixed.apply(n, frame, Tray())) for n in range(50)}) == 1
     stream, seen = rng(), set()
     for _ in range(50):
         assert fixed.begin(0, {}, stream)
-        seen.add(word(fixed.apply(0, frame)))
+        seen.add(word(fixed.apply(0, frame, Tray())))
     assert len(seen) > 10
 
 
@@ -296,14 +297,14 @@ def test_a_frame_fits_from_the_byte_that_holds_the_last_bit(fault: Fault, shorte
 
 def test_raw_dlc_above_8_is_kept() -> None:
     """faults.md: id type, DLC, RTR, FD flags kept; DLC 9..15 mean 8 data bytes (ISO 11898-1)."""
-    result = begun(StuckAtValue(POSITION, 3)).apply(0, Frame(0x185, bytes(8), 0, 15))
+    result = begun(StuckAtValue(POSITION, 3)).apply(0, Frame(0x185, bytes(8), 0, 15), Tray())
     assert result is not None
     assert (result.dlc, result.data) == (15, struct.pack("<ii", 3, 0))
 
 
 def test_flags_are_kept() -> None:
     """The fault itself changes the payload only."""
-    result = begun(StuckAtValue(POSITION, 3)).apply(0, Frame(0x12345678, bytes(8), FLAG_EXTENDED))
+    result = begun(StuckAtValue(POSITION, 3)).apply(0, Frame(0x12345678, bytes(8), FLAG_EXTENDED), Tray())
     assert result is not None
     assert (result.can_id, result.flags) == (0x12345678, FLAG_EXTENDED)
 
@@ -328,7 +329,7 @@ def test_no_fault_raises_or_changes_length_or_id(make: Callable[[], Fault], last
     frame, before = Frame(0x185, data), Frame(0x185, last)
     fits = fault.signal is None or fault.signal.fits(last)
     if fault.begin(0, {0x185: before} if fits else {}, rng()) and fault.fits(frame):
-        result = fault.apply(0, frame)
+        result = fault.apply(0, frame, Tray())
         assert result is None or (result.can_id == 0x185 and len(result.data) == len(data))
     fault.end()
 
@@ -347,9 +348,9 @@ def test_a_copy_in_mid_activation_goes_on_identically(make: Callable[[], Fault])
     fault: Fault = make()
     fault.begin(0, {0x185: joint(4, 5)}, rng())
     for n in range(3):
-        fault.apply(n, joint(n, n))
+        fault.apply(n, joint(n, n), Tray())
     copies = [copy.deepcopy(fault), pickle.loads(pickle.dumps(fault))]
-    on = [fault.apply(n, joint(n, -n)) for n in range(20)]
+    on = [fault.apply(n, joint(n, -n), Tray()) for n in range(20)]
     for twin in copies:
-        assert [twin.apply(n, joint(n, -n)) for n in range(20)] == on
+        assert [twin.apply(n, joint(n, -n), Tray()) for n in range(20)] == on
         assert twin.saturated == fault.saturated

@@ -18,7 +18,9 @@ from fi_gateway.errors import FaultError
 from fi_gateway.events import At, Event, FailureProbability, Never
 from fi_gateway.faults import Bias, BitFlip, Drop, Fault, StuckAt, StuckAtPayload, StuckAtValue
 from fi_gateway.gateway import CONTROLLER_PORT, DRIVE_PORT, Gateway
-from fi_gateway.injector import Injector, Target, Trigger, stream
+from fi_gateway.injector import Injector, Target, stream
+from fi_gateway.outlet import Outlet
+from fi_gateway.trigger import Trigger
 
 POSITION = Signal("position", "right_knee", "right_knee_TPDO1", 0x185, 0, 32, True, 1.0, "rad", 0x6064, 0)
 VELOCITY = Signal("velocity", "right_knee", "right_knee_TPDO1", 0x185, 32, 32, True, 1.0, "rad/s", 0x606C, 0)
@@ -752,7 +754,7 @@ def test_no_frame_makes_the_gateway_raise(traffic: list[tuple[int, int, Frame]])
 class Reverse(Fault):
     """A fault as a user writes it."""
 
-    def apply(self, now: int, frame: Frame) -> Frame | None:
+    def apply(self, now: int, frame: Frame, outlet: Outlet) -> Frame | None:
         return Frame(frame.can_id, frame.data[::-1])
 
 

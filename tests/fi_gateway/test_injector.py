@@ -14,7 +14,9 @@ from fi_gateway.effects import ConstantTime, Effect, Infinite, Once
 from fi_gateway.errors import FaultError
 from fi_gateway.events import At, Event, FailureProbability, Never
 from fi_gateway.faults import Bias, Drop, Fault, StuckAt, StuckAtValue
-from fi_gateway.injector import Injector, Phase, Target, Trigger, graph_order, stream
+from fi_gateway.injector import Injector, Phase, Target, stream
+from fi_gateway.outlet import Tray
+from fi_gateway.trigger import Trigger
 
 WORD = Signal("statusword", "left_hip", "left_hip_TPDO2", 0x281, 0, 16, False, 1.0, "", 0x6041, 0)
 HERE = Target(True, False, (0x281,))
@@ -93,7 +95,7 @@ def test_once_acts_on_one_frame() -> None:
     one.start(0)
     record = one.open(10, "event")
     assert record is not None
-    assert one.act(30, word(5)) == word(0)
+    assert one.act(30, 1, word(5), Tray()) == word(0)
     assert (phase(one), record.end_ns, record.frames_changed) == (Phase.SPENT, 31, 1)
 
 
@@ -103,8 +105,8 @@ def test_once_is_not_used_up_by_a_frame_it_cannot_act_on() -> None:
     one.start(0)
     one.open(10, "event")
     short = Frame(0x281, b"\x01")
-    assert one.act(20, short) is short
-    assert one.act(30, word(5)) == word(0)
+    assert one.act(20, 1, short, Tray()) is short
+    assert one.act(30, 1, word(5), Tray()) == word(0)
     assert (one.too_short, one.injected) == (1, 1)
 
 
@@ -115,7 +117,7 @@ def test_the_three_counts_differ() -> None:
     record = one.open(10, "event")
     assert record is not None
     for n, frame in enumerate([word(0), word(7), Frame(0x281, b""), word(0), word(8)]):
-        one.act(20 + n, frame)
+        one.act(20 + n, 1, frame, Tray())
     assert (one.activated, one.injected, one.manifested, one.too_short) == (1, 4, 2, 1)
     assert (record.frames_seen, record.frames_unfit, record.frames_changed) == (5, 1, 2)
     assert (record.first_before, record.first_after) == (word(7), word(0))
@@ -127,8 +129,8 @@ def test_a_lost_frame_has_no_after() -> None:
     one.start(0)
     record = one.open(10, "event")
     assert record is not None
-    assert one.act(20, word(7)) is None
-    assert (record.first_before, record.first_after, record.frames_changed, record.signal) == (word(7), None, 1, "")
+    assert one.act(20, 1, word(7), Tray()) is None
+    assert (record.first_before, record.first_after, record.frames_lost, record.signal) == (word(7), None, 1, "")
 
 
 @pytest.mark.parametrize(("probability", "injected"), [(0.0, 0), (1.0, 50)])
@@ -139,8 +141,8 @@ def test_a_frame_that_a_drop_spares_is_seen_and_not_injected(probability: float,
     record = one.open(10, "event")
     assert record is not None
     for n in range(50):
-        assert (one.act(10 + n, word(n)) is None) == bool(injected)
-    assert (record.frames_seen, record.frames_injected, record.frames_changed) == (50, injected, injected)
+        assert (one.act(10 + n, 1, word(n), Tray()) is None) == bool(injected)
+    assert (record.frames_seen, record.frames_injected, record.frames_lost) == (50, injected, injected)
     assert (one.injected, one.manifested) == (injected, injected)
 
 
@@ -150,9 +152,9 @@ def test_a_drop_by_chance_injects_exactly_the_frames_it_loses() -> None:
     one.start(0)
     record = one.open(10, "event")
     assert record is not None
-    lost = sum(one.act(10 + n, word(n)) is None for n in range(200))
+    lost = sum(one.act(10 + n, 1, word(n), Tray()) is None for n in range(200))
     assert 0 < lost < 200
-    assert (record.frames_seen, record.frames_injected, record.frames_changed) == (200, lost, lost)
+    assert (record.frames_seen, record.frames_injected, record.frames_lost) == (200, lost, lost)
     assert (one.injected, one.manifested) == (lost, lost)
 
 
@@ -163,7 +165,7 @@ def test_a_value_that_is_replaced_by_itself_is_injected_and_not_manifested() -> 
     record = one.open(10, "event")
     assert record is not None
     for n in range(3):
-        one.act(20 + n, word(7))
+        one.act(20 + n, 1, word(7), Tray())
     assert (record.frames_seen, record.frames_injected, record.frames_changed) == (3, 3, 0)
 
 
@@ -194,7 +196,7 @@ def test_stop_ends_the_window_but_does_not_invent_an_end_for_infinite(effect: Ef
     one.stop(40)
     assert (phase(one), one.next_ns, record.end_ns) == (Phase.SPENT, NEVER, end)
     same = word(5)
-    assert one.act(31, same) is same
+    assert one.act(31, 1, same, Tray()) is same
 
 
 def test_stop_of_an_injector_that_waits_leaves_no_record() -> None:
@@ -238,7 +240,7 @@ def test_a_frame_stamped_before_the_window_passes_when_it_is_read_late() -> None
     one.start(0)
     one.open(10, "event")
     early = word(7)
-    assert one.act(9, early) is early
+    assert one.act(9, 1, early, Tray()) is early
     assert one.injected == 0
 
 
@@ -248,9 +250,9 @@ def test_saturated_values_are_in_the_record() -> None:
     one.start(0)
     record = one.open(10, "event")
     assert record is not None
-    one.act(20, word(65530))
-    one.act(21, word(1))
-    one.act(22, word(65535))
+    one.act(20, 1, word(65530), Tray())
+    one.act(21, 1, word(1), Tray())
+    one.act(22, 1, word(65535), Tray())
     one.close(110)
     assert record.saturated == 2
 
@@ -288,52 +290,6 @@ def test_target_refuses_nothing_and_what_is_no_cob_id(up: bool, down: bool, cob_
         Target(up, down, cob_ids)
 
 
-@pytest.mark.parametrize(("names", "on"), [((), "activated"), (("a",), "manifested"), (("a",), "")])
-def test_trigger_refuses_what_is_not_there_yet(names: tuple[str, ...], on: str) -> None:
-    """The message lists what is allowed."""
-    with pytest.raises(FaultError, match="allowed"):
-        Trigger(names, on)
-
-
-def names(injectors: list[Injector]) -> list[str]:
-    return [one.name for one in graph_order(injectors)]
-
-
-def test_sources_come_before_what_they_trigger_otherwise_as_written() -> None:
-    """faults.md: triggers settle in graph order; chains may branch and join."""
-    join = injector("join", trigger=Trigger(("left", "right")))
-    left = injector("left", trigger=Trigger(("root",)))
-    right = injector("right", trigger=Trigger(("root",)))
-    order = names([injector("z"), join, left, right, injector("root"), injector("a")])
-    assert order == ["z", "root", "left", "right", "join", "a"]
-
-
-def test_a_cycle_is_refused_with_the_cycle_printed() -> None:
-    """faults.md: a cycle is refused with the cycle printed, in the direction in which the triggers run."""
-    ring = [
-        injector("in", trigger=Trigger(("c",))),
-        injector("a", trigger=Trigger(("c",))),
-        injector("b", trigger=Trigger(("a",))),
-        injector("c", trigger=Trigger(("b",))),
-    ]
-    with pytest.raises(FaultError, match="c -> a -> b -> c"):
-        graph_order(ring)
-
-
-def test_an_injector_that_triggers_itself_is_refused() -> None:
-    """The shortest cycle."""
-    with pytest.raises(FaultError, match="a -> a"):
-        graph_order([injector("a", trigger=Trigger(("a",)))])
-
-
-def test_unknown_and_double_names_are_refused() -> None:
-    """The message names what is there."""
-    with pytest.raises(FaultError, match="'ghost', allowed are a, b"):
-        graph_order([injector("a", trigger=Trigger(("ghost",))), injector("b")])
-    with pytest.raises(FaultError, match="given twice"):
-        graph_order([injector("a"), injector("a")])
-
-
 def test_stream_is_the_documented_one() -> None:
     """faults.md: SeedSequence(seed, spawn_key = (run, crc32(name))); crc32("freeze_position") by binascii."""
     expected = np.random.Generator(
@@ -358,10 +314,10 @@ def test_a_copy_keeps_event_fault_and_injector_on_one_stream() -> None:
     one = Injector("x", HERE, Drop(0.5), event, ConstantTime(5 * MS), None, generator)
     one.start(0)
     one.open(one.next_ns, "event")
-    one.act(one.next_ns - 1, word(1))
+    one.act(one.next_ns - 1, 1, word(1), Tray())
     twin = copy.deepcopy(one)
     for each in (one, twin):
         for n in range(30):
-            each.act(each.next_ns - 1, word(n))
+            each.act(each.next_ns - 1, 1, word(n), Tray())
         each.close(each.next_ns)
     assert (one.next_ns, one.manifested) == (twin.next_ns, twin.manifested)

@@ -12,6 +12,7 @@ from fi_gateway.boundary import validate
 from fi_gateway.errors import FaultError
 from fi_gateway.injector import Injector
 from fi_gateway.marked_yaml import FileErrors, parse
+from fi_gateway.outlet import Tray
 from fi_gateway.schema import (
     InjectorSpec,
     build_injectors,
@@ -70,7 +71,7 @@ def built(fault: str, target: str = POSITION) -> Injector:
 
 def outcome(fault: str, target: str = POSITION, data: bytes = bytes(8)) -> bytes | None:
     """What becomes of a TPDO1 of the right knee."""
-    result = built(fault, target).act(1, Frame(0x185, data))
+    result = built(fault, target).act(1, 1, Frame(0x185, data), Tray())
     return None if result is None else result.data
 
 
@@ -125,7 +126,7 @@ def test_a_plain_number_sets_a_signal_without_unit() -> None:
     found = build_injectors(read(a=injector("{type: stuck_at_value, value: 0x27}", target)), PLAN, 1, 0)[0]
     found.start(0)
     found.open(0, "test")
-    result = found.act(1, Frame(0x285, bytes(6)))
+    result = found.act(1, 1, Frame(0x285, bytes(6)), Tray())
     assert result is not None
     assert result.data == bytes.fromhex("270000000000")
 
@@ -134,7 +135,7 @@ def test_drop_loses_the_frame_or_some_of_them() -> None:
     """Probability 1 by default, or as given."""
     assert outcome("{type: drop}", TPDO1) is None
     active = built("{type: drop, probability: 20 %}", TPDO1)
-    lost = sum(active.act(1, Frame(0x185, bytes(8))) is None for _ in range(2000))
+    lost = sum(active.act(1, 1, Frame(0x185, bytes(8)), Tray()) is None for _ in range(2000))
     assert abs(lost - 400) < 4 * (2000 * 0.2 * 0.8) ** 0.5  # 4 sigma of a binomial
 
 
@@ -144,7 +145,7 @@ def test_bits_fixed_stay_for_the_activation(bits: str, fixed: bool) -> None:
     active = built(f"{{type: bit_flip, count: 3{bits}}}")
     seen = set()
     for _ in range(50):
-        result = active.act(1, Frame(0x185, bytes(8)))
+        result = active.act(1, 1, Frame(0x185, bytes(8)), Tray())
         assert result is not None
         word = int.from_bytes(result.data, "little")
         assert word.bit_count() == 3
@@ -236,9 +237,16 @@ def test_switches_and_triggers_reach_the_engine() -> None:
         ("{type: bit_flip, positions: [3], count: 1}", POSITION, ["a.fault.count: positions say which bits"]),
         ("{type: bit_flip, positions: [3], bits: fixed}", POSITION, ["a.fault.bits: positions say which bits"]),
         ("{type: bit_flip, bits: new}", POSITION, ["a.fault.bits: unknown bits 'new'", "random, fixed"]),
-        ("{type: stuck_at}", "{bus: both, node: right_knee, kind: sdo}", ["a.target.kind: not available yet"]),
+        ("{type: stuck_at}", "{bus: both, node: right_knee, kind: sdo}",
+         ["a.target.kind: unknown kind 'sdo'", "sdo_request, sdo_answer, emcy, heartbeat, sync, nmt"]),
         ("{type: stuck_at}", "{bus: both, cob_id: 0x800}", ["a.target.cob_id: COB-ID 0x800 is outside 0x0..0x7ff"]),
-        ("{type: stuck_at}", "{bus: both, cob_id: 0x180/0x7F0}", ["a.target.cob_id: masks", "not available yet"]),
+        ("{type: stuck_at}", "{bus: both, cob_id: 0x185/0x780}",
+         ["a.target.cob_id: 0x185/0x780: bits 0x5 are not in the mask"]),
+        ("{type: stuck_at}", "{bus: both, cob_id: 0x180/780}", ["a.target.cob_id: expected a COB-ID with a mask"]),
+        ("{type: stuck_at}", "{bus: both, cob_id: 0x180/0x1000}", ["a.target.cob_id: COB-ID 0x1000 is outside"]),
+        ("{type: stuck_at}", "{bus: both, cob_id: 0x185, bits: {start: 64, length: 1}}",
+         ["a.target.bits.start: 64 is too large; allowed up to 63"]),
+        ("{type: stuck_at}", "{bus: both, cob_id: 0x185, bits: {start: 0}}", ["a.target.bits.length: missing"]),
         ("{type: stuck_at}", "{bus: both, cob_id: true}", ["a.target.cob_id: expected a COB-ID", "got true"]),
         ("{type: stuck_at}", "{node: right_knee, pdo: TPDO1}", ["a.target.bus: missing; needed: bus"]),
         ("{type: stuck_at}", "{bus: both, node: 5, pdo: TPDO1}", ["a.target.node: expected a text; got 5"]),
@@ -322,13 +330,40 @@ def test_a_bias_must_be_within_the_whole_range(value: str, fits: bool) -> None:
         ({"effect": "{type: once, duration: 1 s}"}, "a.effect.duration: once has no such key (allowed: type)"),
         ({"more": ", enabled: off"}, "a.enabled: expected true or false; got 'off'"),
         ({"more": ", from: boot"}, "a.from: unknown from 'boot' (allowed: time_zero, power_up)"),
-        ({"more": ", rearm: true"}, "a.rearm: not available yet"),
+        ({"more": ", rearm: 1"}, "a.rearm: expected true or false; got 1"),
+        ({"more": ", max_activations: 0"}, "a.max_activations: 0 is too small; allowed from 1 up"),
+        ({"more": ", rearm: true"}, "a: an infinite effect never ends"),
+        ({"more": ", max_activations: 2"}, "a: an infinite effect never ends"),
+        ({"more": ", rearm: false, max_activations: 2", "effect": "{type: once}"}, "a: rearm: false allows one"),
+        ({"more": ", rearm: true, max_activations: 1", "effect": "{type: once}"}, "a: max_activations: 1 leaves"),
         ({"more": ", trigger: {any: []}"}, "a.trigger.any: the list needs at least 1 item"),
         ({"more": ", trigger: {any: b}"}, "a.trigger.any: expected a list such as [a, b]; got 'b'"),
         ({"more": ", trigger: {any: [c]}"}, "a.trigger.any.0: no injector is called 'c' (there are a)"),
         ({"more": ", trigger: {any: [a]}"}, "a.trigger.any: triggers go round in a circle: a -> a"),
-        ({"more": ", trigger: {any: [a], on: ended}"}, "a.trigger.on: on 'ended' is not available yet"),
-        ({"more": ", trigger: [a]"}, "a.trigger: expected a mapping with any, on; got a list"),
+        ({"more": ", trigger: {all: [a], delay: 1 s}"}, "a.trigger.all: triggers go round in a circle: a -> a"),
+        ({"more": ", trigger: {all: [b, b]}"}, "a.trigger.all.0: no injector is called 'b' (there are a)"),
+        ({"more": ", trigger: {any: [a], on: end}"}, "a.trigger.on: unknown on 'end'; did you mean 'ended'?"),
+        ({"more": ", trigger: {any: [a], edge: up}"}, "a.trigger.edge: unknown edge 'up' (allowed: rising, level)"),
+        ({"more": ", trigger: {any: [a], delay: 3}"}, "a.trigger.delay: 3 has no unit; a duration needs one"),
+        ({"more": ", trigger: {any: [a], probability: 2}"}, "a.trigger.probability: 2 is not a probability"),
+        ({"more": ", trigger: {any: [b], all: [c]}"}, "a.trigger: give any (one of), all (of) or frame"),
+        ({"more": ", trigger: {on: ended}"}, "a.trigger: give any (one of), all (of) or frame, one of the three; got"),
+        ({"more": ", trigger: [a]"}, "a.trigger: expected a mapping with any, all, frame, on, edge, delay"),
+        ({"more": ", trigger: {frame: {data: '01'}}"}, "a.trigger.frame.cob_id: missing"),
+        ({"more": ", trigger: {frame: {cob_id: 0x800}}"}, "a.trigger.frame.cob_id: COB-ID 0x800 is outside"),
+        ({"more": ", trigger: {frame: {cob_id: 1, data: '01', mask: 'FF FF'}}"}, "a.trigger.frame: mask 'FF FF' and"),
+        ({"more": ", trigger: {frame: {cob_id: 1}, edge: level}"}, "a.trigger: edge: level needs any or all"),
+        ({"more": ", trigger: {frame: {cob_id: 1}, on: ended}"}, "a.trigger: on: ended is a signal of injectors"),
+        ({"more": ", report: {on: ended}"}, "a.report.frame: missing"),
+        ({"more": ", report: {frame: {cob_id: 0x6F0, data: 1}}"}, "a.report.frame.data: expected 1 to 8 bytes"),
+        ({"more": ", repair: {}"}, "a.repair: give checksum, counter or both"),
+        ({"more": ", repair: {checksum: {type: md5, byte: 7}}"}, "a.repair.checksum.type: unknown type 'md5'"),
+        ({"more": ", repair: {checksum: {type: xor, byte: 8}}"}, "a.repair.checksum.byte: 8 is too large"),
+        ({"more": ", repair: {counter: {start: 62, length: 4}}"}, "a.repair.counter: there is no bit 65"),
+        ({"more": ", repair: {checksum: {type: xor, byte: 1}, counter: {start: 12, length: 4}}"},
+         "a.repair.counter: the counter lies in byte 1, where the checksum is"),
+        ({"more": ", repair: {checksum: {type: xor, byte: 3}}", "target": "{bus: to_drives, kind: nmt}"},
+         "a.repair.checksum.byte: there is no byte 3; NMT (0x000, to_drives) has 2"),
     ],
 )  # fmt: skip
 def test_an_event_effect_or_trigger_that_cannot_be_is_refused(part: dict[str, str], message: str) -> None:
@@ -404,6 +439,11 @@ def test_chains_may_branch_and_join_but_not_go_round(triggers: dict[str, str], c
           "b": injector(more=", trigger: {any: [a]}")}, ["b: will stay silent"]),
         ({"a": injector("{type: drop}", "{bus: both, cob_id: 0x123}", "{type: at, time: 1 s}")},
          ["a.target.cob_id: nothing in this rig sends 0x123"]),
+        ({"a": injector(event="{type: at, time: 1 s}"), "b": injector(),
+          "c": injector(more=", trigger: {all: [a, b]}")}, ["b: will stay silent", "c: will stay silent"]),
+        ({"a": injector(event="{type: at, time: 1 s}"), "b": injector(more=", trigger: {any: [a], probability: 0}")},
+         ["b: will stay silent"]),
+        ({"a": injector(more=", trigger: {frame: {cob_id: 0x6F0}}")}, []),
     ],
 )  # fmt: skip
 def test_injectors_that_can_never_act_are_warned_about(specs: dict[str, str], words: list[str]) -> None:
@@ -428,7 +468,111 @@ def test_the_plan_of_an_injector_is_said_in_words() -> None:
         "included",
         "zero_velocity: velocity of right_knee (0x185, to_controller) reads 0 rpm for 0.3 s; starts when "
         "freeze_position is activated",
+        "triggers:",
+        "  freeze_position",
+        "    `-- activated --> zero_velocity",
     ]
+
+
+def test_chains_are_drawn() -> None:
+    """`exo-hil check` draws who starts whom: branches, joins, chains, frames; each injector in full once."""
+    specs = read(
+        root=injector(event="{type: at, time: 1 s}"),
+        left=injector(more=", trigger: {any: [root]}"),
+        right=injector(more=", trigger: {any: [root], on: manifested, delay: 10 ms}"),
+        join=injector(more=", trigger: {all: [left, right], on: ended, probability: 50 %}"),
+        tail=injector(more=", trigger: {any: [join], edge: level}"),
+        bus=injector(more=", trigger: {frame: {cob_id: 0x6F0, data: 01 00, mask: FF 00, bus: to_drives}, delay: 1 s}"),
+        after=injector(more=", trigger: {any: [bus, tail]}"),
+    )
+    lines = describe_injectors(specs, PLAN, 7 * SECOND)
+    assert lines[lines.index("triggers:") :] == [
+        "triggers:",
+        "  root",
+        "    |-- activated --> left",
+        "    |     `-- ended, with right, with probability 0.5 --> join",
+        "    |           `-- activated, while it holds --> tail",
+        "    |                 `-- activated --> after",
+        "    `-- manifested, 10 ms later --> right",
+        "          `-- ended, with left, with probability 0.5 --> join (above)",
+        "  frame 0x6F0 01 00 (mask FF 00) to_drives",
+        "    `-- 1 s later --> bus",
+        "          `-- activated --> after (above)",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        (", trigger: {any: [b, c]}", "when b or c is activated"),
+        (", trigger: {any: [b], on: manifested}", "when b manifests"),
+        (", trigger: {all: [b, c], on: ended}", "when b and c have all ended"),
+        (", trigger: {all: [b, c]}", "when b and c are all activated"),
+        (", trigger: {any: [b, c], edge: level}", "while b or c is active"),
+        (", trigger: {any: [b], edge: level, on: ended, delay: 2 ms}", "while b has ended, 2 ms later"),
+        (", trigger: {any: [b], probability: 20 %}", "when b is activated, with probability 0.2"),
+        (", trigger: {frame: {cob_id: 0x6F0, data: 0A}}", "with frame 0x6F0 0A"),
+        (", report: {frame: {cob_id: 0x6F1, data: '01', bus: to_drives}, on: ended}",
+         "sends 0x6F1 01 to_drives when it ends"),
+        (", repair: {checksum: {type: crc8_j1850, byte: 7}, counter: {start: 48, length: 4}}",
+         "crc8_j1850 in byte 7 and counter in bits 48..51 put right"),
+    ],
+)  # fmt: skip
+def test_triggers_reports_and_repairs_are_said_in_words(more: str, words: str) -> None:
+    """What starts it, what it says on the bus, what it puts right."""
+    event = "{type: at, time: 1 s}"
+    specs = read(a=injector(more=more), b=injector(event=event), c=injector(event=event))
+    assert describe_injectors(specs, PLAN, 7 * SECOND)[0].endswith(words)
+
+
+@pytest.mark.parametrize(
+    ("effect", "more", "words"),
+    [
+        ("once", "", "in one frame, once a run;"),
+        ("once", ", rearm: true", "in one frame, again and again;"),
+        ("once", ", max_activations: 3", "in one frame, at most 3 times a run;"),
+        ("constant_time, duration: 1 s", "", "for 1 s;"),
+        ("constant_time, duration: 1 s", ", rearm: false", "for 1 s, once a run;"),
+        ("constant_time, duration: 1 s", ", max_activations: 1", "for 1 s, once a run;"),
+        ("constant_time, duration: 1 s", ", max_activations: 2", "for 1 s, at most 2 times a run;"),
+    ],
+)
+def test_how_often_is_said_in_words_and_reaches_the_engine(effect: str, more: str, words: str) -> None:
+    """`rearm`, `max_activations` override."""
+    times = ", ".join(f"{number} s" for number in range(1, 12, 2))
+    text = injector("{type: bias, value: 1 deg}", effect=f"{{type: {effect}}}", more=more,
+                    event=f"{{type: at, times: [{times}]}}")  # fmt: skip
+    specs = read(a=text)
+    assert words in describe_injectors(specs, PLAN, 7 * SECOND)[0]
+    one = build_injectors(specs, PLAN, 1, 0)[0]
+    one.start(0)
+    count = 0
+    while one.next_ns < NEVER:
+        now = one.next_ns
+        one.open(now, "event")
+        one.act(now, 1, Frame(0x185, bytes(8)), Tray())
+        one.close(now + SECOND)
+        count += 1
+    most = {"once a": 1, "most 3": 3, "most 2": 2}
+    assert count == next((number for word, number in most.items() if word in words), 6)
+
+
+@pytest.mark.parametrize(
+    ("more", "expected"),
+    [
+        (", repair: {checksum: {type: xor, byte: 7}}", "05000000 00000005"),
+        (", repair: {checksum: {type: xor, byte: 7, prefix: A0}}", "05000000 000000A5"),
+        (", repair: {counter: {start: 0, length: 4}}", "00000000 00000000"),
+    ],
+)
+def test_a_repair_reaches_the_engine(more: str, expected: str) -> None:
+    """The payload that goes on has it."""
+    one = build_injectors(read(a=injector("{type: bias, value: 5 counts}", more=more)), PLAN, 1, 0)[0]
+    one.start(0)
+    one.open(0, "test")
+    result = one.act(1, 1, Frame(0x185, bytes(8)), Tray())
+    assert result is not None
+    assert result.data == bytes.fromhex(expected)
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,10 @@
 import math
 
 import pytest
+from cantools.database import load_string
+from cantools.database.can import Database
 
+from canopen_exo.dbc import dbc_text
 from canopen_exo.plan import POSITION, TORQUE, BusPlan, JointNode, Pdo
 from fi_gateway.boundary import SpecError, validate
 from fi_gateway.marked_yaml import Keys, parse
@@ -70,6 +73,16 @@ def test_a_signal_is_found_by_name_object_or_message(text: str, cob_id: int, sta
         ("bus: to_controller, cob_id: 0x585", (0x585,), 8),
         ("bus: to_drives, cob_id: 0x605", (0x605,), 8),
         ("bus: both, cob_id: 0x7FF", (0x7FF,), -1),
+        ("bus: to_drives, kind: sdo_request, node: right_knee", (0x605,), 8),
+        ("bus: to_controller, kind: sdo_answer, node: left_hip", (0x581,), 8),
+        ("bus: to_controller, kind: emcy", (0x81, 0x82, 0x83, 0x84, 0x85, 0x86), 8),
+        ("bus: to_controller, kind: heartbeat, node: right_ankle", (0x706,), 1),
+        ("bus: to_drives, kind: heartbeat, node: controller", (0x77F,), 1),
+        ("bus: to_drives, kind: sync", (0x80,), 1),
+        ("bus: to_drives, kind: nmt", (0,), 2),
+        ("bus: to_controller, cob_id: 0x184/0x7FE", (0x184, 0x185), 8),
+        ("bus: both, cob_id: 0x705/0x7FF", (0x705,), 1),
+        ("bus: to_controller, cob_id: 0x100/0x5FF", (0x100, 0x300), -1),
     ],
 )
 def test_without_a_signal_the_target_is_the_whole_frame(text: str, cob_ids: tuple[int, ...], size: int) -> None:
@@ -77,6 +90,48 @@ def test_without_a_signal_the_target_is_the_whole_frame(text: str, cob_ids: tupl
     found = place(text)
     assert (found.cob_ids, found.size, found.signal) == (cob_ids, size, None)
     assert found.known == (size >= 0)
+
+
+def test_a_mask_means_every_id_it_leaves() -> None:
+    """0x180/0x780: id & 0x780 == 0x180; the rig's TPDO1 are among them."""
+    found = place("bus: to_controller, cob_id: 0x180/0x780")
+    assert (found.cob_ids, found.size, found.known) == (tuple(range(0x180, 0x200)), -1, True)
+    assert (found.name, found.words) == ("frames 0x180/0x780", "frames (0x180/0x780, to_controller)")
+    assert not place("bus: both, cob_id: 0x100/0x7F8").known
+
+
+@pytest.mark.parametrize(
+    ("bits", "low", "high", "name"),
+    [
+        ("{start: 0, length: 1}", 0, 1, "right_knee.TPDO1.bit 0"),
+        ("{start: 60, length: 4}", 0, 15, "right_knee.TPDO1.bits 60..63"),
+        ("{start: 3, length: 12, signed: true}", -2048, 2047, "right_knee.TPDO1.bits 3..14"),
+    ],
+)
+def test_bits_are_a_raw_range(bits: str, low: int, high: int, name: str) -> None:
+    """`bits: {start, length, signed}`: a plain number without unit, wherever it lies."""
+    found = place(f"bus: to_controller, cob_id: 0x185, bits: {bits}")
+    assert found.signal is not None
+    assert (found.signal.cob_id, found.signal.low, found.signal.high, found.signal.unit) == (0x185, low, high, "")
+    assert found.name == f"{found.signal.node}.{found.signal.name}" == name
+
+
+DATABASE = load_string(dbc_text(PLAN), "dbc")
+assert isinstance(DATABASE, Database)
+
+
+@pytest.mark.parametrize(
+    ("message", "signal"), [(message.name, one.name) for message in DATABASE.messages for one in message.signals]
+)
+def test_every_signal_of_the_dbc_is_a_target(message: str, signal: str) -> None:
+    """`Message.Signal` means the same here and in the exported DBC: frame, bits, sign, scale."""
+    assert isinstance(DATABASE, Database)
+    expected = DATABASE.get_message_by_name(message)
+    one = expected.get_signal_by_name(signal)
+    found = place(f"bus: both, signal: {message}.{signal}").signal
+    assert found is not None
+    assert (found.cob_id, found.start, found.length) == (expected.frame_id, one.start, one.length)
+    assert (found.signed, found.scale) == (one.is_signed, one.scale)
 
 
 @pytest.mark.parametrize(
@@ -102,9 +157,7 @@ def test_every_target_has_a_name_for_records(text: str, name: str) -> None:
     assert place(text).name == name
 
 
-@pytest.mark.parametrize(
-    ("bus", "directions"), [("to_controller", (True, False)), ("both", (True, True))]
-)
+@pytest.mark.parametrize(("bus", "directions"), [("to_controller", (True, False)), ("both", (True, True))])
 def test_the_bus_is_a_direction_of_travel(bus: str, directions: tuple[bool, bool]) -> None:
     """`bus: to_controller | to_drives | both`."""
     found = place(f"bus: {bus}, cob_id: 0x185")
@@ -126,7 +179,21 @@ def test_the_bus_is_a_direction_of_travel(bus: str, directions: tuple[bool, bool
         ("bus: both, node: right_knee, signal: positon", ("signal",), ["did you mean 'position'?", "velocity"]),
         ("bus: both, node: right_knee, pdo: TPDO1, signal: torque", ("signal",), ["(allowed: position, velocity)"]),
         ("bus: both, signal: position", ("signal",), ["position of which joint?", "left_hip | left_knee"]),
-        ("bus: both, cob_id: 0x705, signal: position", ("cob_id",), ["no signals are mapped into COB-ID 0x705"]),
+        ("bus: both, cob_id: 0x7FF, signal: position", ("cob_id",), ["no signals are mapped into COB-ID 0x7FF"]),
+        ("bus: both, cob_id: 0x705, signal: position", ("signal",), ["unknown signal 'position' (allowed: nmt_state)"]),
+        ("bus: both, kind: sync, signal: nmt_state", ("signal",), ["(allowed: sync_counter)"]),
+        ("bus: both, kind: heartbeat, signal: nmt_state", ("signal",), ["nmt_state of which joint?", "left_hip"]),
+        ("bus: both, kind: sync, node: left_hip", ("node",), ["kind: sync is the controller's alone"]),
+        ("bus: both, kind: emcy, node: controller", ("node",), ["unknown joint 'controller'"]),
+        ("bus: to_drives, kind: emcy", ("bus",), ["EMCY of every joint does not travel to_drives"]),
+        ("bus: to_controller, kind: sdo_request", ("bus",), ["write bus: to_drives"]),
+        ("bus: both, kind: emcy, pdo: TPDO1", ("pdo",), ["either kind or pdo"]),
+        ("bus: both, cob_id: 0x185, kind: emcy", ("kind",), ["either cob_id or kind"]),
+        ("bus: to_drives, cob_id: 0x180/0x780", ("bus",), ["frames does not travel to_drives"]),
+        ("bus: both, kind: emcy, bits: {start: 0, length: 8}", ("bits",), ["one COB-ID", "EMCY 0x081..0x086 has 6"]),
+        ("bus: both, cob_id: 0x705, bits: {start: 4, length: 5}", ("bits",), ["there is no bit 8", "bits 0..7"]),
+        ("bus: both, cob_id: 0x7FF, bits: {start: 60, length: 5}", ("bits",), ["there is no bit 64"]),
+        ("bus: both, cob_id: 0x185, signal: position, bits: {start: 0, length: 8}", ("bits",), ["either signal or"]),
         ("bus: both, cob_id: 0x185, node: right_knee", ("node",), ["either cob_id or node"]),
         ("bus: both, cob_id: 0x185, pdo: TPDO1", ("pdo",), ["either cob_id or pdo"]),
         ("bus: both, node: right_knee", (), ["which frames?", "signal", "pdo", "cob_id"]),

@@ -7,7 +7,7 @@ import pytest
 
 from canopen_exo.bus.frame import Frame
 from canopen_exo.bus.medium import Transmission
-from fi_gateway.injector import Activation
+from fi_gateway.activation import Activation
 from testbench.record import Array, BusStats, Commands, RigEvent, RunRecord, Truth
 
 JOINTS = ("left_hip", "left_knee", "left_ankle", "right_hip", "right_knee", "right_ankle")

@@ -11,7 +11,7 @@ from canopen_exo.bus.frame import FLAG_BRS, FLAG_ESI, FLAG_EXTENDED, FLAG_FD, FL
 from canopen_exo.bus.lateness import Lateness
 from canopen_exo.bus.medium import Transmission
 from canopen_exo.bus.node import NEVER
-from fi_gateway.injector import Activation
+from fi_gateway.activation import Activation
 from testbench.parts import (
     ControlNote,
     GatewayPart,

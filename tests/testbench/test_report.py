@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from fi_gateway.injector import Activation
+from fi_gateway.activation import Activation
 from hlc.limits import limits_of
 from testbench.record import RunRecord
 from testbench.report import Plotted, fault_figure, joint_at_fault, joints_figure, plot_files, save, windows

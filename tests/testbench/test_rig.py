@@ -535,7 +535,7 @@ def test_sync_lost_for_good_is_detected_and_leaves_the_legs_in_their_range(pinne
     (loss,) = faulted.activations
     assert loss.signal == "SYNC 0x080"
     assert loss.start_ns == faulted.time0_ns + SECOND
-    assert loss.frames_seen == loss.frames_injected == loss.frames_changed == 5  # then the drives knew, and all ended
+    assert loss.frames_seen == loss.frames_injected == loss.frames_lost == 5  # then the drives knew, and all ended
     told = [note for note in faulted.notes if "8700" in note.text]
     assert sorted(note.node for note in told) == sorted(NAMES)
     assert all(1.0 < note.time_s < 1.012 for note in told)

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from canopen_exo.bus.medium import Transmission
-from fi_gateway.injector import Activation
+from fi_gateway.activation import Activation
 from hlc.controller import KP
 from hlc.limits import limits_of
 from joint_emulators.models.exoskeleton import USER_75KG

@@ -266,7 +266,7 @@ def test_overrides_apply_in_order() -> None:
         ("injectors.freeze.effect.duration=1 s",
          ": no 'freeze' in injectors; there are freeze_position, zero_velocity"),
         ("injectors.freeze_position.target={bus: both}", ": which frames? add signal (controlword, target_torque, "
-         "position, velocity, statusword, torque, error_code), pdo (RPDO1, TPDO1, TPDO2) or cob_id"),
+         "position, velocity, statusword, torque, error_code), pdo (RPDO1, TPDO1, TPDO2), kind or cob_id"),
         ("injectors.zero_velocity.fault={type: bias, value: 3}",
          ": injectors.zero_velocity.fault.value: velocity of right_knee: 3 has no unit; an angular velocity needs one "
          "(units: rad/s, deg/s, rpm; for example '65.2 rpm')"),
@@ -313,6 +313,9 @@ def test_a_scenario_can_be_read_aloud() -> None:
         "included",
         "zero_velocity: velocity of right_knee (0x185, to_controller) reads 0 rpm for 0.3 s; starts when "
         "freeze_position is activated",
+        "triggers:",
+        "  freeze_position",
+        "    `-- activated --> zero_velocity",
         "verdict: fails if a joint leaves its range of travel",
         "expected: golden.tracking_rmse < 0.01 rad",
         "expected: failures == 0",

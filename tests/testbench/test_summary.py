@@ -9,7 +9,7 @@ import pytest
 
 from canopen_exo.bus.node import NEVER
 from canopen_exo.bus.trace import trace_hash
-from fi_gateway.injector import Activation
+from fi_gateway.activation import Activation
 from hlc.limits import limits_of
 from testbench.errors import BenchError
 from testbench.expect import parse_expectation

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 
-from fi_gateway.injector import Activation
+from fi_gateway.activation import Activation
 from hlc.limits import JointLimits, limits_of
 from testbench import expect
 from testbench.errors import BenchError

@@ -1,0 +1,77 @@
+"""The record of one activation of an injector: when, why, and what became of the frames.
+
+Three counts are kept apart, as in fault-injection practice: activated (windows opened), injected (frames the fault
+acted on) and manifested (frames that really came out different, late, in addition, or not at all).
+"""
+
+from typing import Final, final
+
+from canopen_exo.bus.frame import Frame
+from canopen_exo.bus.node import NEVER
+
+_STATE: Final = (
+    "end_ns",
+    "frames_seen",
+    "frames_unfit",
+    "frames_injected",
+    "frames_changed",
+    "frames_lost",
+    "frames_delayed",
+    "frames_inserted",
+    "saturated",
+    "first_before",
+    "first_after",
+)
+"""What `__reduce__` copies besides the constructor arguments."""
+
+
+@final
+class Activation:
+    """One activation. Times in ns on the loop's clock.
+
+    injector, index: name, and number of the activation from 0; signal: "node.name", for whole frames the target's name;
+    cause: "event", "trigger:<name>" ("trigger:<a>+<b>" for all of them), "frame:0x6F0" or "command"; due_ns: the time
+    drawn, given, triggered (delay included) or commanded;
+    start_ns: when the window opened, later than due_ns only when the fault had to wait for a value;
+    duration_ns: as drawn or given, NEVER for no limit;
+    end_ns: first instant outside the window, as planned until it closes; a window without limit keeps NEVER.
+    frames_seen: target frames that reached it; frames_unfit: of those, too short to act on; frames_injected: acted on
+    (a drop that spares a frame does not act on it); of those, each at most once: frames_changed: went on at once with
+    other content; frames_lost; frames_delayed: went on later, changed or not, or waited behind one that did.
+    frames_inserted: further frames; saturated: values cut at the signal's range;
+    first_before, first_after: the first frame hit (first_after None: it was lost; first_before None: it was inserted
+    without one arriving).
+    """
+
+    def __init__(
+        self, injector: str, index: int, signal: str, cause: str, due_ns: int, start_ns: int, duration_ns: int
+    ) -> None:
+        self.injector: Final[str] = injector
+        self.index: Final[int] = index
+        self.signal: Final[str] = signal
+        self.cause: Final[str] = cause
+        self.due_ns: Final[int] = due_ns
+        self.start_ns: Final[int] = start_ns
+        self.duration_ns: Final[int] = duration_ns
+        self.end_ns: int = min(start_ns + duration_ns, NEVER)
+        self.frames_seen: int = 0
+        self.frames_unfit: int = 0
+        self.frames_injected: int = 0
+        self.frames_changed: int = 0
+        self.frames_lost: int = 0
+        self.frames_delayed: int = 0
+        self.frames_inserted: int = 0
+        self.saturated: int = 0
+        self.first_before: Frame | None = None
+        self.first_after: Frame | None = None
+
+    @property
+    def manifested(self) -> int:
+        """Frames changed, lost, delayed or inserted."""
+        return self.frames_changed + self.frames_lost + self.frames_delayed + self.frames_inserted
+
+    def __reduce__(
+        self,
+    ) -> tuple[type["Activation"], tuple[str, int, str, str, int, int, int], dict[str, object]]:
+        given = (self.injector, self.index, self.signal, self.cause, self.due_ns, self.start_ns, self.duration_ns)
+        return Activation, given, {name: getattr(self, name) for name in _STATE}
