@@ -41,6 +41,8 @@ CORE: Final = (
     "canopen_exo/sdo.py",
     "canopen_exo/signal.py",
     "canopen_exo/sync.py",
+    "fi_gateway/conditions.py",
+    "fi_gateway/distributions.py",
     "fi_gateway/effects.py",
     "fi_gateway/events.py",
     "fi_gateway/faults.py",

@@ -5,8 +5,8 @@
     part       := "(" condition ")" | comparison
     comparison := SIGNAL [ "&" MASK ] OPERATOR VALUE
 
-SIGNAL: `right_knee.position`, `right_knee.0x6064` or `right_knee_TPDO1.position`; OPERATOR: < <= > >= == !=; VALUE: in a
-unit of the signal, or in its counts; MASK: bits of a signal without unit, such as `statusword & 0x6F == 0x27`.
+SIGNAL: `right_knee.position`, `right_knee.0x6064` or `right_knee_TPDO1.position`; OPERATOR: < <= > >= == !=; VALUE: in
+a unit of the signal, or in its counts; MASK: bits of a signal without unit, such as `statusword & 0x6F == 0x27`.
 Left out: `not`, arithmetic, signals compared with each other, values of SDOs.
 """
 
@@ -33,7 +33,7 @@ _WORD: Final = re.compile(r"\s*(\(|\)|(?:and|or)\b)", re.ASCII)
 _SIGNAL: Final = r"[A-Za-z_][A-Za-z0-9_]*\.[A-Za-z0-9_]+"
 _COMPARISON: Final = re.compile(
     rf"\s*({_SIGNAL})\s*(?:&\s*(0x[0-9a-fA-F]{{1,16}}|[0-9]{{1,20}})\s*)?(<=|>=|==|!=|<|>)"
-    r"\s*([^()<>=!&]+?)(?=\s*(?:[()]|\band\b|\bor\b|$))",
+    r"\s*([+-]?[.0-9][^()<>=!&]*?)(?=\s*(?:[()]|\band\b|\bor\b|$))",
     re.ASCII,
 )
 _WHOLE: Final = re.compile(r"([+-]?[0-9]{1,20}|0x[0-9a-fA-F]{1,16})\s*(counts|counts/s)?", re.ASCII)

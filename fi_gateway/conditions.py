@@ -68,7 +68,7 @@ class AllOf(Term):
 
     def holds(self) -> bool:
         """In written order, up to the first that does not hold."""
-        for part in self.parts:
+        for part in self.parts:  # noqa: SIM110 (a generator per frame is what the compiled core avoids)
             if not part.holds():
                 return False
         return True
@@ -86,7 +86,7 @@ class AnyOf(Term):
 
     def holds(self) -> bool:
         """In written order, up to the first that holds."""
-        for part in self.parts:
+        for part in self.parts:  # noqa: SIM110 (as above)
             if part.holds():
                 return True
         return False

@@ -70,7 +70,10 @@ class Normal(Distribution):
 
 @final
 class Weibull(Distribution):
-    """Density k/s (t/s)^(k-1) exp(-(t/s)^k). shape: k > 0, below 1 early failures, above 1 wear-out; scale_ns: s > 0."""
+    """Density k/s (t/s)^(k-1) exp(-(t/s)^k).
+
+    shape: k > 0, below 1 early failures, above 1 wear-out; scale_ns: s > 0, 63 % of the times are shorter.
+    """
 
     def __init__(self, shape: float, scale_ns: float) -> None:
         super().__init__()
@@ -144,7 +147,10 @@ class Poisson(Distribution):
 
 @final
 class Binomial(Distribution):
-    """Whole periods: P(k) = C(n, k) p^k (1-p)^(n-k), k = 0..n. trials: n, 1..1e9; probability: p, 0..1; period_ns: > 0."""
+    """Whole periods: P(k) = C(n, k) p^k (1-p)^(n-k), k = 0..n.
+
+    trials: n, 1..1e9; probability: p, 0..1; period_ns: > 0.
+    """
 
     def __init__(self, trials: int, probability: float, period_ns: int) -> None:
         super().__init__(period_ns)
@@ -195,7 +201,7 @@ class Curve(Distribution):
     def __init__(self, times_ns: tuple[int, ...], weights: tuple[float, ...]) -> None:
         super().__init__()
         if len(times_ns) < 2 or len(times_ns) != len(weights):
-            raise FaultError(f"curve: {len(times_ns)} times, {len(weights)} weights given, allowed two and more, as many")
+            raise FaultError(f"curve: {len(times_ns)} times, {len(weights)} weights given, allowed 2 and more, as many")
         areas = [0.0]
         for at in range(1, len(times_ns)):
             length = times_ns[at] - times_ns[at - 1]

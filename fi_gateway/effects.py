@@ -51,7 +51,10 @@ class Once(Effect):
 
 @final
 class Frames(Effect):
-    """So many frames the fault acted on, 1 and more; then the injector arms again. FIBlock: Once, for several samples."""
+    """So many frames the fault acted on, 1 and more; then the injector arms again.
+
+    FIBlock: Constant time, whose window is a number of samples; its last one is clean.
+    """
 
     def __init__(self, frames: int) -> None:
         super().__init__(frames, True)

@@ -184,7 +184,7 @@ class FailureOfFrame(Event):
 
 @final
 class Every(Event):
-    """Every n-th target frame, counted from time 0 on, also inside activations: frames n, 2n, ... frames: n, 1 and more.
+    """Every n-th target frame: n, 2n, ..., counted from time 0 on, also inside activations. frames: n, 1 and more.
 
     FIBlock: none.
     """
@@ -238,10 +238,10 @@ class When(Event):
 class GaitPhase(Event):
     """In every stride, the SYNC nearest to a phase of the gait. phase: 0 to below 1 stride, 0 is right heel strike.
 
-    The phase is that of the controller's status frame (COB-ID 0x2FF: state u8, cycle u16, phase u16, little endian), and
-    between two of these it goes on with each SYNC as it has gone on per SYNC so far; so it is known from the second
-    status frame on, which is long before time 0. A phase that is passed while SYNCs are missing is met by the next
-    SYNC or status frame. Less than a stride must lie between two status frames. FIBlock: none.
+    The phase is that of the controller's status frame (COB-ID 0x2FF: state u8, cycle u16, phase u16, little endian),
+    and between two of these it goes on with each SYNC as it has gone on per SYNC so far; so it is known from the
+    second status frame on, which is long before time 0. A phase that is passed while SYNCs are missing is met by the
+    next SYNC or status frame. Less than a stride must lie between two status frames. FIBlock: none.
     """
 
     def __init__(self, phase: float) -> None:

@@ -60,8 +60,13 @@ UNITS: Final[dict[Dimension, dict[str, Fraction | float]]] = {
 """Unit -> SI per unit; the first unit of each dimension is the SI one. Exact where a fraction."""
 
 _SPELLINGS: Final = {
-    **{"Nm": "N m", "mNm": "mN m", "µs": "us", "μs": "us"},  # micro sign and Greek mu
-    **{"/s": "1/s", "/min": "1/min", "/h": "1/h"},
+    "Nm": "N m",
+    "mNm": "mN m",
+    "µs": "us",  # micro sign
+    "μs": "us",  # Greek mu
+    "/s": "1/s",
+    "/min": "1/min",
+    "/h": "1/h",
 }
 _EXAMPLES: Final = {
     Dimension.TIME: "0.3 s",

@@ -13,13 +13,13 @@ from pydantic import Field
 from canopen_exo.plan import BusPlan
 from fi_gateway.boundary import Count, Flag, SpecError, SpecModel, validate
 from fi_gateway.chain import draw_chains
+from fi_gateway.effect_specs import InfiniteSpec
 from fi_gateway.errors import FaultError
 from fi_gateway.fault_specs import FaultChoice
 from fi_gateway.injector import Injector, Target, stream
 from fi_gateway.marked_yaml import Data, Keys, did_you_mean, dotted
-from fi_gateway.quantity import format_duration
 from fi_gateway.target import TargetSpec, resolve
-from fi_gateway.timing_specs import EffectChoice, EventChoice, InfiniteSpec
+from fi_gateway.timing_specs import EffectChoice, EventChoice, Timing
 from fi_gateway.trigger_specs import RepairSpec, ReportSpec, TriggerSpec
 
 
@@ -56,6 +56,10 @@ class InjectorSpec(SpecModel):
         """As the engine takes it; None: as the effect says."""
         return True if self.rearm is None and (self.max_activations or 0) > 1 else self.rearm
 
+    def timing(self) -> Timing:
+        """Event and effect together."""
+        return Timing(self.event, self.effect, self.rearms(), self.max_activations or 0)
+
 
 Complain = Callable[[Keys, str], None]
 """Takes a complaint: where, counted from `injectors`, and what."""
@@ -69,6 +73,8 @@ class _Parts(SpecModel):
     fault: FaultChoice | None = None
     trigger: TriggerSpec | None = None
     repair: RepairSpec | None = None
+    event: EventChoice | None = None
+    effect: EffectChoice | None = None
 
 
 def check_injectors(injectors: Mapping[str, Data], plan: BusPlan, report: Complain) -> None:
@@ -79,9 +85,11 @@ def check_injectors(injectors: Mapping[str, Data], plan: BusPlan, report: Compla
     parts = {}
     for name, given in injectors.items():
         found = given if isinstance(given, dict) else {}
-        keys = ("target", "fault", "trigger", "repair")
+        keys = ("target", "fault", "trigger", "repair", "event", "effect")
         read = [validate(_Parts, {key: found.get(key)}, (), None) or _Parts() for key in keys]
-        parts[name] = _Parts(read[0].target, read[1].fault, read[2].trigger, read[3].repair)
+        parts[name] = _Parts(
+            read[0].target, read[1].fault, read[2].trigger, read[3].repair, read[4].event, read[5].effect
+        )
     _check(parts, plan, report)
 
 
@@ -90,6 +98,9 @@ def _check(parts: Mapping[str, _Parts], plan: BusPlan, report: Complain) -> None
     for name, part in parts.items():
         if part.target is not None:
             _check_place(name, part.target, part, plan, report)
+        for key, timed in (("event", part.event), ("effect", part.effect)):
+            if timed is not None:
+                _check_timed(name, key, timed, plan, report)
     for name, trigger in triggers.items():
         sources = trigger.sources
         for number, source in enumerate(sources):
@@ -115,6 +126,13 @@ def _check_place(name: str, target: TargetSpec, part: _Parts, plan: BusPlan, rep
                 spec.build(place)
         except SpecError as error:
             report((name, key, *error.keys), str(error))
+
+
+def _check_timed(name: str, key: str, timed: EventChoice | EffectChoice, plan: BusPlan, report: Complain) -> None:
+    try:
+        timed.build(plan, stream(0, 0, name))
+    except SpecError as error:
+        report((name, key, *error.keys), str(error))
 
 
 def _cycles(triggers: Mapping[str, tuple[str, ...]]) -> list[tuple[str, ...]]:
@@ -148,32 +166,34 @@ def _way_back(first: str, triggers: Mapping[str, tuple[str, ...]]) -> tuple[str,
 def injector_warnings(specs: Mapping[str, InjectorSpec], plan: BusPlan, duration_ns: int) -> list[str]:
     """What is allowed and still looks like a mistake: injectors that can never act in a motion of that length [ns]."""
     warnings = []
-    live = _live(specs, duration_ns)
+    live = _live(specs, plan, duration_ns)
     for name, spec in specs.items():
         if not spec.enabled:
             continue
-        late = [format_duration(time) for time in spec.event.times() if time >= duration_ns]
-        if late and spec.start == "time_zero":
-            end = format_duration(duration_ns)
-            warnings.append(f"injectors.{name}.event: {', '.join(late)} comes after the motion has ended at {end}")
-        elif name not in live:
-            reason = "its event never happens and " + (
+        place = resolve(spec.target, plan)
+        late = [time for time in spec.event.times() if time >= duration_ns and spec.start == "time_zero"]
+        if name not in live and not late:
+            silent = spec.event.silent(plan)
+            reason = f"its event never happens{'' if spec.event.type == 'never' else f' ({silent})'} and " + (
                 "nothing that triggers it can start" if spec.trigger is not None else "it has no trigger"
             )
             warnings.append(f"injectors.{name}: will stay silent: {reason}")
-        if not resolve(spec.target, plan).known:
-            cob_ids = resolve(spec.target, plan).name.removeprefix("frames ")
+        if spec.start == "time_zero":
+            for key, text in spec.timing().warnings(place, plan, duration_ns):
+                warnings.append(f"injectors.{name}.{key}: {text}")
+        if not place.known:
+            cob_ids = place.name.removeprefix("frames ")
             warnings.append(f"injectors.{name}.target.cob_id: nothing in this rig sends {cob_ids}")
     return warnings
 
 
-def _live(specs: Mapping[str, InjectorSpec], duration_ns: int) -> set[str]:
+def _live(specs: Mapping[str, InjectorSpec], plan: BusPlan, duration_ns: int) -> set[str]:
     """The injectors that can start, by their event or by a chain of triggers."""
     live: set[str] = set()
     for name, spec in specs.items():
         times = spec.event.times()
         late = len(times) > 0 and times[0] >= duration_ns and spec.start == "time_zero"
-        if spec.enabled and spec.event.fires() and not late:
+        if spec.enabled and not spec.event.silent(plan) and not late:
             live.add(name)
     for _ in specs:
         for name, spec in specs.items():
@@ -200,7 +220,7 @@ def describe_injectors(specs: Mapping[str, InjectorSpec], plan: BusPlan, duratio
 def _sentence(name: str, spec: InjectorSpec, plan: BusPlan, duration_ns: int) -> str:
     place = resolve(spec.target, plan)
     starts = []
-    event = spec.event.words(plan, spec.effect, duration_ns)
+    event = spec.timing().words(name, place, plan, duration_ns)
     if event:
         starts.append(event + (" after power-up" if spec.start == "power_up" else ""))
     if spec.trigger is not None:
@@ -225,7 +245,10 @@ def _how_long(spec: InjectorSpec) -> str:
 def build_injectors(specs: Mapping[str, InjectorSpec], plan: BusPlan, seed: int, run: int) -> list[Injector]:
     """The engine's injectors in written order, each with its own random stream; raises FaultError for bad specs."""
     problems: list[str] = []
-    parts = {name: _Parts(spec.target, spec.fault, spec.trigger, spec.repair) for name, spec in specs.items()}
+    parts = {
+        name: _Parts(spec.target, spec.fault, spec.trigger, spec.repair, spec.event, spec.effect)
+        for name, spec in specs.items()
+    }
     _check(parts, plan, lambda keys, text: problems.append(f"{dotted(('injectors', *keys))}: {text}"))
     if problems:
         raise FaultError("\n".join(problems))
@@ -239,7 +262,7 @@ def _build(name: str, spec: InjectorSpec, plan: BusPlan, rng: Generator) -> Inje
         Target(place.to_controller, place.to_drives, place.cob_ids, place.name),
         spec.fault.build(place),
         spec.event.build(plan, rng),
-        spec.effect.build(),
+        spec.effect.build(plan, rng),
         spec.trigger.build() if spec.trigger is not None else None,
         rng,
         spec.enabled,

@@ -1,6 +1,12 @@
-"""Events: times on the grid, against the geometric distribution of scipy."""
+"""Events: times on the grid, against the geometric distribution of scipy; and frames with which something begins.
+
+The distributions of all the others: test_distributions.
+"""
 
 import copy
+import pickle
+import struct
+from math import floor
 
 import pytest
 from hypothesis import given
@@ -8,9 +14,26 @@ from hypothesis import strategies as st
 from numpy.random import PCG64, Generator
 from scipy import stats
 
+from canopen_exo.bus.frame import Frame
 from canopen_exo.bus.node import MS, NEVER
+from canopen_exo.plan import HLC_STATUS, POSITION, SYNC, TPDO1
+from canopen_exo.signal import Signal
+from fi_gateway.conditions import Condition, Reading, Within
+from fi_gateway.distributions import Binomial, Exponential, Poisson
 from fi_gateway.errors import FaultError
-from fi_gateway.events import At, FailureProbability, Never
+from fi_gateway.events import (
+    FROM_CONTROLLER,
+    FROM_DRIVES,
+    At,
+    Drawn,
+    Event,
+    Every,
+    FailureOfFrame,
+    FailureProbability,
+    GaitPhase,
+    Never,
+    When,
+)
 
 
 def rng(seed: int = 1) -> Generator:
@@ -121,3 +144,184 @@ def test_bad_parameters_are_refused(probability: float, period: int, message: st
     """The message names what is allowed."""
     with pytest.raises(FaultError, match=message):
         FailureProbability(probability, period, rng())
+
+
+# --- drawn times -----------------------------------------------------------------------------------------------------
+
+
+@given(
+    st.sampled_from([Exponential(3e6), Poisson(0.7, MS), Poisson(4, 7), Binomial(5, 0.5, MS)]),
+    st.lists(st.integers(0, 10**8), min_size=1, max_size=20).map(sorted),
+    st.integers(0, 2**32),
+)
+def test_a_drawn_time_does_not_lie_in_the_past_and_stays_until_it_is_over(
+    distribution: Exponential | Poisson | Binomial, ends: list[int], seed: int
+) -> None:
+    """An announced event is not drawn again; those that count periods lie on the grid from time 0."""
+    event = Drawn(distribution, rng(seed))
+    for end in ends:
+        due = event.next(end)
+        assert due >= end
+        assert event.next(due) == due
+        assert not distribution.period_ns or due % distribution.period_ns == 0
+
+
+def test_no_periods_are_the_next_grid_point() -> None:
+    """binomial with p = 0: at once, on the grid; at its end an injector on the grid is hit again."""
+    event = Drawn(Binomial(3, 0.0, MS), rng())
+    assert [event.next(after) for after in (0, 1, MS, MS + 1)] == [0, MS, MS, 2 * MS]
+
+
+def test_a_drawn_time_beyond_all_time_is_never() -> None:
+    """Nothing overflows."""
+    assert Drawn(Poisson(1e9, NEVER // 2), rng()).first() == NEVER
+
+
+# --- frames ----------------------------------------------------------------------------------------------------------
+
+TARGET = Frame(0x185, bytes(8))
+
+
+def test_every_nth_frame_is_counted_from_time_0() -> None:
+    """every {n} frames: n, 2n, 3n ..., whatever the injector does meanwhile."""
+    event = Every(3)
+    assert event.watches_target
+    assert event.first() == NEVER
+    times = [-2, -1, 0, *range(1, 20)]
+    assert [now for now in times if event.observe(now, TARGET)] == [2, 5, 8, 11, 14, 17]
+
+
+def test_frames_before_time_0_have_no_trial() -> None:
+    """p = 1: from the first frame after time 0 on every one; p = 0: none, and nothing is drawn."""
+    event = FailureOfFrame(1.0, rng())
+    assert event.watches_target
+    assert event.first() == NEVER
+    assert [event.observe(now, TARGET) for now in (-5, -1, 0, 1, 7)] == [False, False, True, True, True]
+    unused, source = rng(4), rng(4)
+    never = FailureOfFrame(0.0, source)
+    assert not any(never.observe(now, TARGET) for now in range(1000))
+    assert source.random() == unused.random()
+
+
+@pytest.mark.parametrize("build", [lambda: Every(0), lambda: FailureOfFrame(1.1, rng()), lambda: GaitPhase(1.0)])
+def test_bad_frame_events_are_refused(build: type[Event]) -> None:
+    """The message names what is allowed."""
+    with pytest.raises(FaultError, match="allowed"):
+        build()
+
+
+def knee(limit: int) -> Condition:
+    """position of node 5 below a number of counts."""
+    signal = Signal("position", "knee", "knee_TPDO1", TPDO1 + 5, 0, 32, True, 1.0, "rad", POSITION.index, 0)
+    reading = Reading(FROM_DRIVES, signal)
+    return Condition(Within(reading, -(1 << 40), limit - 1), [reading])
+
+
+def at_position(counts: int) -> Frame:
+    return Frame(TPDO1 + 5, struct.pack("<ii", counts, 0))
+
+
+def test_a_condition_starts_when_it_becomes_true() -> None:
+    """Rising edge: once, with the frame that makes it true; what is true at time 0 becomes true then."""
+    event = When(knee(0))
+    assert event.watches == ((FROM_DRIVES, 0x185),)
+    assert event.first() == NEVER
+    given_ = [(-9, -5), (-3, -5), (1, -5), (3, -5), (5, 2), (7, 0), (9, -1), (11, -1)]
+    assert [now for now, counts in given_ if event.observe(now, at_position(counts))] == [1, 9]
+
+
+def test_a_condition_may_also_be_a_level() -> None:
+    """With every frame while it is true; before time 0 none."""
+    event = When(knee(0), rising=False)
+    given_ = [(-3, -5), (1, -5), (3, -5), (5, 2), (7, 0), (9, -1), (11, -1)]
+    assert [now for now, counts in given_ if event.observe(now, at_position(counts))] == [1, 3, 9, 11]
+
+
+# --- gait phase ------------------------------------------------------------------------------------------------------
+
+CYCLES = 750  # of a stride of 1.5 s at 500 Hz
+FADE_IN = 750
+
+
+def walk(event: GaitPhase, last: int, stride: int = CYCLES, lost: frozenset[int] = frozenset()) -> list[int]:
+    """Cycles from time 0 at which the event comes, as the controller says them on the bus. lost: cycles without SYNC.
+
+    The gateway knows time 0 with the status frame of cycle 0; phase: floor of 1/65536 stride.
+    """
+    found = []
+    for cycle in range(-FADE_IN, last + 1):
+        due = False
+        if cycle not in lost:
+            due = event.observe(2 * MS * cycle if cycle > 0 else -1, Frame(SYNC, b"\x01"))
+        if cycle % 10 == 0:
+            state, phase = (1, 0) if cycle < 0 else (2, cycle), floor(cycle % stride / stride * 65536)
+            frame = Frame(HLC_STATUS, struct.pack("<BHH", *state, phase))
+            due = event.observe(2 * MS * cycle + 1 if cycle >= 0 else -1, frame) or due
+        if due:
+            found.append(cycle)
+    return found
+
+
+@given(st.integers(0, 65535), st.sampled_from([750, 749, 100, 250, 1001]))
+def test_gait_phase_is_the_sync_nearest_to_it_in_every_stride(raw: int, stride: int) -> None:
+    """Taken from the status frame and SYNC only; right on a SYNC, or within a cycle's half of it."""
+    phase = raw / 65536
+    last = 3 * stride + stride // 2
+    found = walk(GaitPhase(phase), last, stride)
+    exact = [(phase + turn) * stride for turn in range(-1, 4)]
+    wanted = [cycle for cycle in exact if -0.49 < cycle < last - 0.51]
+    near = [cycle for cycle in exact if -0.51 < cycle < last + 0.51]
+    assert len(wanted) <= len(found) <= len(near)
+    assert all(min(abs(cycle - one) for one in exact) <= 0.51 for cycle in found)  # 0.01: rounding of phase
+
+
+@pytest.mark.parametrize(
+    ("phase", "cycles"),
+    [(0.0, [0, 750, 1500]), (0.5, [375, 1125]), (0.3, [225, 975]), (1 / 750, [1, 751, 1501]), (749 / 750, [749, 1499])],
+)
+def test_a_phase_on_a_cycle_is_met_in_that_cycle(phase: float, cycles: list[int]) -> None:
+    """Also between two status frames, and at time 0 with the status frame that says it."""
+    assert walk(GaitPhase(phase), 1505) == cycles
+
+
+def test_a_phase_passed_without_sync_is_met_late_and_once() -> None:
+    """SYNCs 370..379 are lost with 0.5 among them: the status frame of 380 meets it."""
+    lost = frozenset(range(370, 381))
+    assert walk(GaitPhase(0.5), 1200, lost=lost) in ([370, 1125], [380, 1125])
+    assert walk(GaitPhase(0.5), 1200, lost=frozenset({375})) == [376, 1125]
+
+
+def test_a_phase_is_not_met_before_it_is_known() -> None:
+    """Joined in mid-stride: from the second status frame on, and not for what lies behind."""
+    event = GaitPhase(0.5)
+    assert not event.observe(5, Frame(SYNC, b""))
+    assert not event.observe(6, Frame(HLC_STATUS, struct.pack("<BHH", 2, 390, 390 * 65536 // 750)))
+    assert not any(event.observe(7, Frame(SYNC, b"")) for _ in range(10))
+    assert not event.observe(8, Frame(HLC_STATUS, struct.pack("<BHH", 2, 400, 400 * 65536 // 750)))
+    assert not any(event.observe(9, Frame(SYNC, b"")) for _ in range(700))
+
+
+@given(st.lists(st.tuples(st.sampled_from([SYNC, HLC_STATUS]), st.binary(max_size=8)), max_size=60))
+def test_no_bytes_break_the_gait_phase_and_copies_go_on_alike(frames: list[tuple[int, bytes]]) -> None:
+    """Bad bytes are data; short, starting and stopped status frames."""
+    event = copied = GaitPhase(0.25)
+    for cob_id, data in frames:
+        copied = copy.deepcopy(copied)
+        assert event.observe(3, Frame(cob_id, data)) == copied.observe(3, Frame(cob_id, data))
+    assert event.watches == ((FROM_CONTROLLER, SYNC), (FROM_CONTROLLER, HLC_STATUS))
+
+
+@pytest.mark.parametrize(
+    "event",
+    [Drawn(Exponential(1e6), rng()), FailureOfFrame(0.3, rng()), Every(4), When(knee(50)), When(knee(50), False)],
+    ids=lambda one: type(one).__name__,
+)
+def test_a_copied_event_goes_on_alike(event: Event) -> None:
+    """Snapshots: interpreted or compiled, in mid-run."""
+    for now in range(200):
+        event = pickle.loads(pickle.dumps(event))
+        copied = copy.deepcopy(event)
+        frame = at_position(now * 37 % 100)
+        assert event.observe(now, frame) == copied.observe(now, frame)
+        assert event.next(now * MS) == copied.next(now * MS)
+        assert (event.watches, event.watches_target) == (copied.watches, copied.watches_target)

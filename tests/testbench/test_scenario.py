@@ -260,7 +260,7 @@ def test_overrides_apply_in_order() -> None:
     ("override", "message"),
     [
         ("injectors.freeze_position.effect.duration=0.5",
-         ": 0.5 has no unit; a duration needs one (units: s, ms, us, ns, min; for example '0.3 s')"),
+         ": 0.5 has no unit; a duration needs one (units: s, ms, us, ns, min, h; for example '0.3 s')"),
         ("injectors.freeze_position.effect.durtion=0.5 s",
          ": constant_time has no such key; did you mean 'duration'? (allowed: type, duration)"),
         ("injectors.freeze.effect.duration=1 s",
@@ -309,7 +309,8 @@ def test_a_scenario_can_be_read_aloud() -> None:
         "motion: walking, stride 1.5 s, 7 s after a fade-in of one stride",
         "seed: 2020",
         "freeze_position: position of right_knee (0x185, to_controller) held at its last value for 0.3 s; starts with "
-        "probability 0.0005 per 1 ms (0.5/s, about 3.0 activations expected in 7 s, dead time included)",
+        "probability 0.0005 per 1 ms (0.5/s), about 3.1 activations of freeze_position expected in 7 s, dead time "
+        "included",
         "zero_velocity: velocity of right_knee (0x185, to_controller) reads 0 rpm for 0.3 s; starts when "
         "freeze_position is activated",
         "triggers:",
