@@ -210,7 +210,7 @@ def _unknown_key(key: str, owner: object) -> str:
     allowed = _keys(owner)
     if is_dataclass(owner) and key in getattr(owner, "later", ()):
         return f"not available yet; available: {', '.join(allowed)}"
-    what = f"{_tag(owner)} has no such key" if "type" in allowed else "unknown key"
+    what = f"{tag(owner)} has no such key" if "type" in allowed else "unknown key"
     return f"{what}{did_you_mean(key, allowed)} (allowed: {', '.join(allowed)})"
 
 
@@ -233,7 +233,7 @@ def _walk(model: object, location: tuple[int | str, ...]) -> tuple[Keys, object]
             here = choice.find(str(item))
             continue
         if members:
-            here = next((member for member in members if _tag(member) == item), None)
+            here = next((member for member in members if tag(member) == item), None)
             continue
         keys = (*keys, item)
         arguments = get_args(bare)
@@ -263,7 +263,7 @@ def _members(bare: object) -> tuple[object, ...]:
     return get_args(bare) if get_origin(bare) in (Union, types.UnionType) else ()
 
 
-def _tag(member: object) -> str:
+def tag(member: object) -> str:
     """The word a class goes by: its only `type`, or its name when several lead to it."""
     kind = _hints(member)["type"]
     return str(get_args(kind)[0]) if get_origin(kind) is Literal else getattr(member, "__name__", str(member))
@@ -273,7 +273,7 @@ def _tags(hint: object) -> list[str]:
     choice = _choice(hint)
     if choice is not None:
         return choice.words()
-    return [_tag(member) for member in _members(_bare(hint))]
+    return [tag(member) for member in _members(_bare(hint))]
 
 
 def _choice(hint: object) -> Choice | None:

@@ -1,10 +1,11 @@
 """Effects as a scenario file gives them: one small class each.
 
 Each reads its own keys, builds the engine's effect, and says in words for how long. Durations are ns.
+Further ones come from other packages, see `fi_gateway.kinds`.
 """
 
 from dataclasses import dataclass
-from typing import Annotated, Literal, TypeAlias
+from typing import Annotated, Final, Literal, TypeAlias
 
 from numpy.random import Generator
 from pydantic import Field
@@ -15,6 +16,7 @@ from fi_gateway.condition_specs import ConditionText, resolve_condition
 from fi_gateway.distribution_specs import LawChoice
 from fi_gateway.distributions import Normal
 from fi_gateway.effects import ConstantTime, DrawnTime, Effect, Frames, Infinite, Once, Until
+from fi_gateway.kinds import Kinds
 from fi_gateway.quantity import format_duration
 
 
@@ -168,13 +170,11 @@ class UntilSpec(EffectSpec):
         return f"until {self.condition}"
 
 
-EffectChoice: TypeAlias = Annotated[
-    OnceSpec
-    | FramesSpec
-    | ConstantTimeSpec
-    | InfiniteSpec
-    | MttrSpec
-    | DistributedEffectSpec
-    | UntilSpec,
-    Field(discriminator="type"),
-]
+EFFECTS: Final[Kinds[EffectSpec]] = Kinds(
+    "effect",
+    "exo_hil.effects",
+    EffectSpec,
+    (OnceSpec, FramesSpec, ConstantTimeSpec, InfiniteSpec, MttrSpec, DistributedEffectSpec, UntilSpec),
+)
+
+EffectChoice: TypeAlias = Annotated[EffectSpec, EFFECTS]

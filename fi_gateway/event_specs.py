@@ -1,10 +1,11 @@
 """Events as a scenario file gives them: one small class each.
 
-Each reads its own keys, builds the engine's event, and says in words when. Durations are ns.
+Each reads its own keys, builds the engine's event, and says in words when. Durations are ns. Further ones come from
+other packages, see `fi_gateway.kinds`.
 """
 
 from dataclasses import dataclass
-from typing import Annotated, Literal, TypeAlias
+from typing import Annotated, Final, Literal, TypeAlias
 
 from numpy.random import Generator
 from pydantic import BeforeValidator, Field, PlainSerializer, WithJsonSchema
@@ -25,6 +26,7 @@ from fi_gateway.events import (
     Never,
     When,
 )
+from fi_gateway.kinds import Kinds
 from fi_gateway.quantity import Dimension, format_duration, format_quantity, parse_duration, parse_quantity
 
 
@@ -299,15 +301,21 @@ class NeverSpec(EventSpec):
         return ""
 
 
-EventChoice: TypeAlias = Annotated[
-    AtSpec
-    | FailureProbabilitySpec
-    | RateSpec
-    | MttfSpec
-    | DistributedEventSpec
-    | EverySpec
-    | GaitPhaseSpec
-    | WhenSpec
-    | NeverSpec,
-    Field(discriminator="type"),
-]
+EVENTS: Final[Kinds[EventSpec]] = Kinds(
+    "event",
+    "exo_hil.events",
+    EventSpec,
+    (
+        AtSpec,
+        FailureProbabilitySpec,
+        RateSpec,
+        MttfSpec,
+        DistributedEventSpec,
+        EverySpec,
+        GaitPhaseSpec,
+        WhenSpec,
+        NeverSpec,
+    ),
+)
+
+EventChoice: TypeAlias = Annotated[EventSpec, EVENTS]

@@ -18,7 +18,7 @@ from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler, TypeAdapter, Va
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, InitErrorDetails, core_schema
 
-from fi_gateway.boundary import Choice, SpecModel, dump
+from fi_gateway.boundary import Choice, SpecModel, dump, tag
 
 S = TypeVar("S", bound=SpecModel)
 
@@ -28,15 +28,15 @@ _DOTTED: Final = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)+")
 class Kinds(Choice, Generic[S]):
     """The classes of one choice. Stands in a hint: `Annotated[FaultSpec, FAULTS]`.
 
-    what: "fault"; group: of the entry points, "exo_hil.faults"; base: what every class derives from;
-    built_in: word -> class. Each is a frozen dataclass with a field `type`, which keeps the word as written.
+    what: "fault"; group: of the entry points, "exo_hil.faults"; base: what every class derives from. Each is a frozen
+    dataclass with a field `type`: the Literal word of one that is built in, else a Text that keeps the word as written.
     """
 
-    def __init__(self, what: str, group: str, base: type[S], built_in: dict[str, type[S]]) -> None:
+    def __init__(self, what: str, group: str, base: type[S], built_in: tuple[type[S], ...]) -> None:
         self.what: Final[str] = what
         self.group: Final[str] = group
         self.base: Final[type[S]] = base
-        self.built_in: Final[dict[str, type[S]]] = built_in
+        self.built_in: Final[dict[str, type[S]]] = {tag(spec): spec for spec in built_in}
 
     def words(self) -> list[str]:
         """Built in, then installed."""

@@ -124,15 +124,20 @@ def _check_place(name: str, target: TargetSpec, part: _Parts, plan: BusPlan, rep
         try:
             if spec is not None:
                 spec.build(place)
-        except SpecError as error:
-            report((name, key, *error.keys), str(error))
+        except FaultError as error:
+            report((name, key, *_keys(error)), str(error))
+
+
+def _keys(error: FaultError) -> Keys:
+    """Which value is wrong; () when the engine's object of a type from elsewhere has refused it."""
+    return error.keys if isinstance(error, SpecError) else ()
 
 
 def _check_timed(name: str, key: str, timed: EventChoice | EffectChoice, plan: BusPlan, report: Complain) -> None:
     try:
         timed.build(plan, stream(0, 0, name))
-    except SpecError as error:
-        report((name, key, *error.keys), str(error))
+    except FaultError as error:
+        report((name, key, *_keys(error)), str(error))
 
 
 def _cycles(triggers: Mapping[str, tuple[str, ...]]) -> list[tuple[str, ...]]:

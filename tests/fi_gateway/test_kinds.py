@@ -44,7 +44,7 @@ class Stranger:
     """Is no Shape."""
 
 
-SHAPES: Kinds[Shape] = Kinds("shape", "nobody.has_this_group", Shape, {"circle": Circle})
+SHAPES: Kinds[Shape] = Kinds("shape", "nobody.has_this_group", Shape, (Circle,))
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,7 +122,7 @@ def installed(monkeypatch: pytest.MonkeyPatch, *entries: tuple[str, str]) -> Kin
     """A choice with these entry points: (name, path)."""
     found = [EntryPoint(name, path, "shapes.group") for name, path in entries]
     monkeypatch.setattr(fi_gateway.kinds, "entry_points", lambda group: found if group == "shapes.group" else [])
-    return Kinds("shape", "shapes.group", Shape, {"circle": Circle})
+    return Kinds("shape", "shapes.group", Shape, (Circle,))
 
 
 def test_installed_words_come_after_the_built_in_ones(monkeypatch: pytest.MonkeyPatch, elsewhere: str) -> None:
