@@ -189,8 +189,7 @@ class Gateway(Node):
         self._passage.advance(now - 1)
         for injector in self.injectors:
             injector.stop(now)
-        self._passage.plan()
-        self._arrange(now)
+        self.settle(now)
 
     def settle(self, now: int) -> None:
         """Do all that is due up to and including `now`, after injectors were armed or disarmed from outside."""
@@ -219,8 +218,8 @@ class Gateway(Node):
         for the COB-ID of live control, and for times from a power-up that is over.
         """
         name, commands = injector.name, self._commands
-        if commands is not None and commands.cob_id in injector.target.cob_ids:
-            raise FaultError(f"injector {name}: its target {commands.cob_id:#x} is the COB-ID of live control")
+        if commands is not None and injector.takes(commands.cob_id):
+            raise FaultError(f"injector {name}: its target or trigger {commands.cob_id:#x} is that of live control")
         if injector.from_power_up and not at_once and self._power_up != NEVER:
             raise FaultError(f"injector {name}: power-up is over; give it before the rig runs, or from: time_zero")
         self.settle(now - 1)
@@ -237,10 +236,10 @@ class Gateway(Node):
     def attach(self, commands: CommandPort) -> None:
         """Let `commands` read the frames of its COB-ID; no fault may have its hands on them. Raises FaultError."""
         for injector in self.injectors:
-            if commands.cob_id in injector.target.cob_ids:
+            if injector.takes(commands.cob_id):
                 raise FaultError(
-                    f"injector {injector.name}: its target {commands.cob_id:#x} is the COB-ID of live control; "
-                    "give another one for either"
+                    f"injector {injector.name}: its target or trigger {commands.cob_id:#x} is the COB-ID of live "
+                    "control; give another one for either"
                 )
         self._commands = commands
         self._passage.windows.keeps_opened = True
