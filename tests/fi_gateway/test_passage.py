@@ -51,6 +51,9 @@ class Slow(Fault):
         outlet.later(now + wait, frame, self.in_order)
         return None
 
+    def __reduce__(self) -> tuple[type["Slow"], tuple[bool, int]]:
+        return Slow, (self.in_order, self.step)
+
 
 class Twice(Fault):
     """Each frame, and before it a further one; after `later` ns (0 for none) a third."""
@@ -66,6 +69,9 @@ class Twice(Fault):
             outlet.later(now + self.later, frame, False)
         return frame
 
+    def __reduce__(self) -> tuple[type["Twice"], tuple[int, int]]:
+        return Twice, (self.later, self.can_id)
+
 
 class Rename(Fault):
     """Another COB-ID, or an extended one."""
@@ -77,6 +83,9 @@ class Rename(Fault):
 
     def apply(self, now: int, frame: Frame, outlet: Outlet) -> Frame | None:
         return Frame(self.can_id, frame.data, self.flags)
+
+    def __reduce__(self) -> tuple[type["Rename"], tuple[int, int]]:
+        return Rename, (self.can_id, self.flags)
 
 
 class Beat(Fault):
@@ -97,6 +106,9 @@ class Beat(Fault):
     def wake(self, now: int, outlet: Outlet) -> None:
         self.wake_at = now + self.period
         outlet.insert(Frame(self.can_id, b"\xbe"))
+
+    def __reduce__(self) -> tuple[type["Beat"], tuple[int, int], dict[str, object]]:
+        return Beat, (self.period, self.can_id), {"wake_at": self.wake_at}
 
 
 class Stuck(Beat):

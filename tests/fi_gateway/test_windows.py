@@ -426,7 +426,8 @@ def test_two_gateways_chain_over_the_bus() -> None:
         2 * MS,
     )  # fmt: skip
     pattern = BusFrame(0x6F0, b"\x2a", b"\xff", True, False)
-    second = Gateway([injector("second", effect=ConstantTime(MS), trigger=Trigger(frame=pattern), fault=Drop())], 2 * MS)
+    trigger = Trigger(frame=pattern)
+    second = Gateway([injector("second", effect=ConstantTime(MS), trigger=trigger, fault=Drop())], 2 * MS)
     media = [Medium(name, index, 1_000_000) for index, name in enumerate(("controller", "middle", "drive"))]
     loop = Loop(media)
     loop.connect(second, [media[0], media[1]])
