@@ -174,8 +174,11 @@ class Gateway(Node):
 
     def wake(self, now: int, out: Out) -> None:
         """Open and close the windows that are due, and send what faults have put off until now."""
-        self._passage.advance(now)
-        self._flush(now, out)
+        passage = self._passage
+        passage.advance(now)
+        self.wake_at = passage.next_ns
+        if passage.speaks:
+            self._flush(now, out)
 
     def port_changed(self, now: int, state: PortState, out: Out) -> None:
         """Count the notice, note what changed, and stop or resume sending there."""
@@ -272,13 +275,12 @@ class Gateway(Node):
             self._observe(now, route.kind, frame)
         if now >= passage.next_ns:
             passage.advance(now)
-        if route.watchers or passage.windows.is_waiting:
+        if route.watchers or passage.is_waiting:
             passage.watch(now, port, route, frame)
         left = passage.through(now, port, route.injectors, frame)
-        if passage.outbox or passage.windows.opened:
+        self.wake_at = passage.next_ns
+        if passage.speaks:
             self._flush(now, out)
-        else:
-            self.wake_at = passage.next_ns
         return left
 
     def _observe(self, now: int, kind: int, frame: Frame) -> None:
@@ -302,11 +304,12 @@ class Gateway(Node):
     def _arrange(self, now: int) -> None:
         """Ask to be woken when there is something to do, or at once to say what could not be said without an `out`."""
         passage = self._passage
-        self.wake_at = now if passage.outbox or passage.windows.opened else passage.next_ns
+        self.wake_at = now if passage.speaks else passage.next_ns
 
     def _flush(self, now: int, out: Out) -> None:
         """Send what goes out besides the frame that has arrived, and say what has become active."""
         passage = self._passage
+        passage.speaks = False
         if passage.windows.opened:
             opened, passage.windows.opened = passage.windows.opened, []
             if self._commands is not None:
@@ -318,7 +321,6 @@ class Gateway(Node):
                     self.undelivered[1 - port] += 1
                 else:
                     out.send(port, frame)
-        self.wake_at = passage.next_ns
 
     def _change(self, now: int, port: int, state: ErrorState, cause: str) -> None:
         """A port has a new state."""
