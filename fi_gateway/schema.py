@@ -15,6 +15,7 @@ from fi_gateway.boundary import Count, Flag, SpecError, SpecModel, validate
 from fi_gateway.chain import draw_chains
 from fi_gateway.effect_specs import InfiniteSpec
 from fi_gateway.errors import FaultError
+from fi_gateway.event_specs import NeverSpec
 from fi_gateway.fault_specs import FaultChoice
 from fi_gateway.injector import Injector, Target, stream
 from fi_gateway.marked_yaml import Data, Keys, did_you_mean, dotted
@@ -179,7 +180,7 @@ def injector_warnings(specs: Mapping[str, InjectorSpec], plan: BusPlan, duration
         late = [time for time in spec.event.times() if time >= duration_ns and spec.start == "time_zero"]
         if name not in live and not late:
             silent = spec.event.silent(plan)
-            reason = f"its event never happens{'' if spec.event.type == 'never' else f' ({silent})'} and " + (
+            reason = f"its event never happens{'' if isinstance(spec.event, NeverSpec) else f' ({silent})'} and " + (
                 "nothing that triggers it can start" if spec.trigger is not None else "it has no trigger"
             )
             warnings.append(f"injectors.{name}: will stay silent: {reason}")

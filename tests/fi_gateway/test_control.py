@@ -574,7 +574,7 @@ def test_ids_that_mean_something_else_are_refused(port: int, command_id: int, st
 def test_a_target_of_a_fault_cannot_be_the_command_id() -> None:
     """No fault has its hands on the commands."""
     control = live(injector())
-    with pytest.raises(FaultError, match="x: its target 0x185"):
+    with pytest.raises(FaultError, match="x: its target or trigger 0x185"):
         control.gateway.attach(BusControl(control, CONTROLLER_PORT, 0x185))
 
 
