@@ -277,7 +277,7 @@ class GaitPhase(Event):
         return True
 
     def _read(self, data: bytes) -> None:
-        """A status frame: `_at` counts the phase on over the strides. SYNCs in between: as it says itself, in motion."""
+        """A status frame. `_at` counts the phase on over the strides; the SYNCs between two are told in motion."""
         if len(data) < 5 or data[0] not in (STATUS_STARTING, STATUS_MOTION):
             return
         cycle, phase = data[1] | data[2] << 8, data[3] | data[4] << 8
