@@ -240,8 +240,8 @@ class GaitPhase(Event):
 
     The phase is that of the controller's status frame (COB-ID 0x2FF: state u8, cycle u16, phase u16, little endian),
     and between two of these it goes on with each SYNC as it has gone on per SYNC so far; so it is known from the
-    second status frame on, which is long before time 0. A phase that is passed while SYNCs are missing is met by the
-    next SYNC or status frame. Less than a stride must lie between two status frames. FIBlock: none.
+    second status frame on, which is long before time 0. A phase that is passed while SYNCs are missing is met by a
+    later SYNC or status frame. Less than a stride must lie between two status frames. FIBlock: none.
     """
 
     def __init__(self, phase: float) -> None:
@@ -250,6 +250,7 @@ class GaitPhase(Event):
             raise FaultError(f"gait_phase: phase {phase} strides given, allowed 0 to below 1")
         self._phase: Final[float] = phase
         self._at: int = -1
+        self._cycle: int = -1
         self._advance: int = 0
         self._syncs: int = 0
         self._since: int = 0
@@ -276,22 +277,26 @@ class GaitPhase(Event):
         return True
 
     def _read(self, data: bytes) -> None:
-        """Phase and state of a status frame. `_at` counts on over the strides."""
+        """A status frame. `_at` counts the phase on over the strides; the SYNCs between two are told in motion."""
         if len(data) < 5 or data[0] not in (STATUS_STARTING, STATUS_MOTION):
             return
-        phase = data[3] | data[4] << 8
+        cycle, phase = data[1] | data[2] << 8, data[3] | data[4] << 8
         if self._at < 0:
             self._at = phase
         else:
             step = (phase - self._at) % _STRIDE
             self._at += step
-            if self._since:
+            syncs = self._since
+            if self._cycle >= 0 and data[0] == STATUS_MOTION:
+                syncs = (cycle - self._cycle) & 0xFFFF
+            if syncs:
                 self._advance += step
-                self._syncs += self._since
+                self._syncs += syncs
+        self._cycle = cycle if data[0] == STATUS_MOTION else -1
         self._since = 0
 
     def __reduce__(self) -> tuple[type["GaitPhase"], tuple[float], dict[str, object]]:
-        names = ("_at", "_advance", "_syncs", "_since", "_met", "_begun")
+        names = ("_at", "_cycle", "_advance", "_syncs", "_since", "_met", "_begun")
         return GaitPhase, (self._phase,), {name: getattr(self, name) for name in names}
 
 

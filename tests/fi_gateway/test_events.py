@@ -285,10 +285,27 @@ def test_a_phase_on_a_cycle_is_met_in_that_cycle(phase: float, cycles: list[int]
 
 
 def test_a_phase_passed_without_sync_is_met_late_and_once() -> None:
-    """SYNCs 370..379 are lost with 0.5 among them: the status frame of 380 meets it."""
-    lost = frozenset(range(370, 381))
-    assert walk(GaitPhase(0.5), 1200, lost=lost) in ([370, 1125], [380, 1125])
+    """0.5 is cycle 375: the next SYNC, whose own phase is one too low for that, or the next status frame."""
     assert walk(GaitPhase(0.5), 1200, lost=frozenset({375})) == [376, 1125]
+    assert walk(GaitPhase(0.5), 1200, lost=frozenset(range(371, 381))) == [380, 1125]
+
+
+def test_missing_syncs_do_not_change_the_pace() -> None:
+    """A third of the SYNCs of the first stride is lost: phases of the second are met in their cycles all the same."""
+    lost = frozenset(cycle for cycle in range(1, 700) if cycle % 3 == 1)
+    for cycle in (801, 805, 809, 1499):
+        assert walk(GaitPhase(cycle % CYCLES / CYCLES), 1499, lost=lost)[-1] == cycle
+
+
+def test_a_status_frame_said_twice_changes_nothing() -> None:
+    """No SYNC between them, in motion or before it."""
+    for state in (1, 2):
+        event = GaitPhase(0.5)
+        for number in range(0, 360, 10):
+            frame = Frame(HLC_STATUS, struct.pack("<BHH", state, number if state == 2 else 0, number * 65536 // 750))
+            assert not any(event.observe(1, one) for one in (*[Frame(SYNC, b"")] * 10, frame, frame))
+        met = [number for number in range(351, 400) if event.observe(1, Frame(SYNC, b""))]
+        assert met == [375]
 
 
 def test_a_phase_is_not_met_before_it_is_known() -> None:
