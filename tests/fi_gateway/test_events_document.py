@@ -1,6 +1,7 @@
 """docs/events.md: every example in it is read, and every type there is has one."""
 
 import re
+from collections.abc import Collection
 from pathlib import Path
 from typing import Final, get_args
 
@@ -9,8 +10,8 @@ import pytest
 from canopen_exo.plan import BusPlan, JointNode
 from fi_gateway.boundary import validate
 from fi_gateway.distribution_specs import LawChoice
-from fi_gateway.effect_specs import EffectChoice
-from fi_gateway.event_specs import EventChoice
+from fi_gateway.effect_specs import EFFECTS
+from fi_gateway.event_specs import EVENTS
 from fi_gateway.marked_yaml import parse
 from fi_gateway.schema import InjectorSpec, build_injectors
 
@@ -18,6 +19,7 @@ TEXT: Final = (Path(__file__).parents[2] / "docs" / "events.md").read_text(encod
 EXAMPLES: Final = [line for block in re.findall(r"```yaml\n(.*?)```", TEXT, re.DOTALL) for line in block.splitlines()]
 NAMES: Final = ("left_hip", "left_knee", "left_ankle", "right_hip", "right_knee", "right_ankle")
 PLAN: Final = BusPlan(tuple(JointNode(name, number, 54_900, 131_072) for number, name in enumerate(NAMES, 1)))
+LAWS: Final = [get_args(model.__annotations__["type"])[0] for model in get_args(get_args(LawChoice)[0])]
 
 
 @pytest.mark.parametrize("line", EXAMPLES)
@@ -39,10 +41,10 @@ def test_every_example_is_read_and_built(line: str) -> None:
     assert build_injectors({"x": spec}, PLAN, 1, 0)
 
 
-@pytest.mark.parametrize(("key", "choice"), [("event", EventChoice), ("effect", EffectChoice), ("law", LawChoice)])
-def test_every_type_is_in_a_table_and_has_an_example(key: str, choice: object) -> None:
+@pytest.mark.parametrize(("key", "choice"), [("event", EVENTS.built_in), ("effect", EFFECTS.built_in), ("law", LAWS)])
+def test_every_type_is_in_a_table_and_has_an_example(key: str, choice: Collection[str]) -> None:
     """No type without a line, no line without a type."""
-    types = {get_args(model.__annotations__["type"])[0] for model in get_args(get_args(choice)[0])}
+    types = set(choice)
     examples = {match[1] for line in EXAMPLES if (match := re.match(rf"{key}: {{type: (\w+)", line))}
     assert examples == types
     assert all(f"\n| `{name}` |" in TEXT for name in types)
