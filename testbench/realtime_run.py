@@ -17,7 +17,7 @@ from fi_gateway.control_socket import ask_listing
 from fi_gateway.errors import FaultError
 from hlc.limits import limits_of
 from testbench.errors import BenchError
-from testbench.merge import add_reasons, merge, time_zero_of
+from testbench.merge import IncompleteError, add_reasons, merge, time_zero_of
 from testbench.parts import PartError, read_gateway, read_hlc, read_joints
 from testbench.record import RunRecord
 from testbench.run import CHUNK_NS, LEAVE_NS, START_NS, Progress, Result
@@ -159,7 +159,12 @@ def _gather(rig: Supervisor, setup: Setup) -> RealTimeRun:
 
     hlc, gateway, joints = read("hlc", read_hlc), read("gateway", read_gateway), read("joints", read_joints)
     plan, duration_ns = setup.scenario.plan, setup.scenario.motion.duration_ns
-    record = merge(plan, duration_ns, hlc, gateway, joints, rig.rows)
+    try:
+        record = merge(plan, duration_ns, hlc, gateway, joints, rig.rows)
+    except IncompleteError as error:
+        parts = {"hlc": hlc, "gateway": gateway, "joints": joints}
+        served = [f"{name} {part.service.lateness.words()}" for name, part in parts.items() if part is not None]
+        raise IncompleteError(f"{error}; wake-ups served late: {'; '.join(served)}") from error
     zero = time_zero_of(plan, hlc, gateway, rig.rows)
     cycles = duration_ns // plan.cycle_ns if hlc is None else int(hlc.cycles.size)
     timing = judge_timing(plan, zero, cycles, hlc, gateway, joints)

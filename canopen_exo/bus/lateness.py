@@ -62,6 +62,11 @@ class Lateness:
         for index in range(_BINS):
             self._bins[index] += other._bins[index]
 
+    def words(self) -> str:
+        """For people, in ms."""
+        shares = ", ".join(f"{share} % within {self.percentile(share / 100) / 1e6:.1f} ms" for share in (50, 90, 99))
+        return f"{self.count}, {shares}, the latest {self.worst_ns / 1e6:.1f} ms"
+
     def document(self) -> LatenessDocument:
         """For JSON."""
         bins = [[_lower(index), number] for index, number in enumerate(self._bins) if number]

@@ -5,6 +5,8 @@ structures: can_frame (16 bytes) and canfd_frame (72 bytes), in the machine's by
 A frame costs one recvmsg and one send, a drained interface one more recvmsg; select is the loop's.
 An interface that goes down is reported, what is sent meanwhile is lost and counted, and the socket lives on by itself;
 one that disappears is opened again with a back-off of 20 ms to 1 s.
+The kernel begins to stamp a moment after the first socket of the machine asked for it; until then it stamps what is
+read, so that the first frames of a machine may count as having come with the reading, never later than that.
 Leaves out: setting the bit rate and bringing interfaces up (`ip link`), filters in the kernel, hardware time stamps.
 """
 

@@ -11,6 +11,7 @@ import pytest
 
 import testbench.plugin.lockstep  # noqa: F401 (an inner run must not be the first to load MuJoCo: it unloads its modules)
 from testbench.plugin.hooks import named_buses
+from tests.parity.patience import Late, Patience, told_late
 
 pytest_plugins = ["pytester"]
 
@@ -400,19 +401,19 @@ def test_real(exo):
 
 
 @pytest.mark.realtime
-def test_the_same_words_drive_a_rig_on_the_hub(pytester: pytest.Pytester) -> None:
+def test_the_same_words_drive_a_rig_on_the_hub(pytester: pytest.Pytester, patience: Patience) -> None:
     """Injection, expectation, sending, golden comparison on processes; a busy machine skips, it does not fail."""
     pytester.makepyfile(REAL)
-    said: list[str] = []
-    for _ in range(3):
+
+    def attempt() -> Late | None:
         result = run_apart(pytester, "--exo-bus=hub", FAST)
         if result.ret == pytest.ExitCode.OK:
-            return
-        found = [line for line in result.outlines if line.startswith("timing: ")]
-        is_late = any(not line.startswith("timing: 0 of ") for line in found)
-        assert is_late or "not ready after" in result.stdout.str(), result.stdout.str()
-        said += found
-    pytest.skip("the machine is too busy: " + "; ".join(said))
+            return None
+        late = told_late(result.stdout.str(), 10.0)
+        assert late, result.stdout.str()
+        return Late("; ".join(late))
+
+    patience.until_punctual(attempt)
 
 
 @pytest.mark.realtime

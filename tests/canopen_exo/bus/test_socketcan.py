@@ -25,6 +25,7 @@ from canopen_exo.bus.socketcan import (
     open_can_socket,
     prepare_socket,
 )
+from tests.stamps import kernel_stamps
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="SocketCAN is Linux's")
 
@@ -213,11 +214,12 @@ FRAME = Frame(0x181, bytes(range(8)))
 def test_receive_drains_in_order_with_kernel_stamps(wire: Wire) -> None:
     """Drain until it would block; stamps are the kernel's, on the loop's clock."""
     sent = [Frame(0x100 + number, bytes((number,))) for number in range(20)]
-    before = time.monotonic_ns() - wire.channel.epoch_ns
-    for frame in sent:
-        wire.feed(encode(frame))
-    after = time.monotonic_ns() - wire.channel.epoch_ns
-    arrivals = wire.channel.receive()
+    with kernel_stamps():
+        before = time.monotonic_ns() - wire.channel.epoch_ns
+        for frame in sent:
+            wire.feed(encode(frame))
+        after = time.monotonic_ns() - wire.channel.epoch_ns
+        arrivals = wire.channel.receive()
     assert [arrival.frame for arrival in arrivals] == sent
     stamps = [arrival.stamp_ns for arrival in arrivals]
     assert stamps == sorted(stamps)
