@@ -14,7 +14,7 @@ from typing import Final
 from benchmarks.compile_core import no_compiler
 from tests.parity.patience import BUSY
 
-WIDTH: Final = 160
+WIDTH: Final = 240
 """Characters of a reason; the recipe that ran the test has printed all of it."""
 
 

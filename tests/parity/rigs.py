@@ -65,10 +65,10 @@ def walk(rig: Supervisor, for_ns: int = 300 * MS) -> Late | None:
     except ProcessError as error:
         if hlc.code != 1:
             raise
-        return Late(str(error)[:600])  # it gave up and says why: drives that miss SYNC for five cycles stop
+        return Late(str(error))  # it gave up and says why: drives that miss SYNC for five cycles stop
     if hlc.code is None and rig.watch.time_zero != NEVER:
         return None
-    return Late(f"the motion did not go on: {hlc.obituary()[:600]}")
+    return Late(f"the motion did not go on: {hlc.obituary()}")
 
 
 def heard(rig: Supervisor, condition: Callable[[], bool]) -> Late | None:

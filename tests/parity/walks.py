@@ -94,7 +94,7 @@ def attempt_run(setup: Setup) -> RealTimeRun | Late:
     try:
         run = run_once(setup)
     except IncompleteError as error:  # drives that miss SYNC for five cycles stop by themselves
-        return Late(str(error)[:600])
+        return Late(str(error))
     # A process that stands still overruns a transmit queue of 64 frames with what it catches up.
     assert not run.timing.lost or run.timing.counted, run.timing.lost
     reasons = run.timing.reasons(limits_in(setup.scenario)) or list(run.record.invalid_reasons)

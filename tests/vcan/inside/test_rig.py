@@ -47,7 +47,7 @@ def test_run_realtime_on_vcan_with_a_fault_gives_verdict_and_result_folder(
         if code != INVALID:
             return program
         if not (out / "summary.json").exists():  # drives that missed SYNC for five cycles have stopped by themselves
-            return Late(program.printed[-300:].strip())
+            return Late(program.printed.strip().splitlines()[-1])
         document = json.loads((out / "summary.json").read_text())
         assert not [reason for reason in document["invalid_reasons"] if "were lost" in reason]
         return Late(", ".join(document["invalid_reasons"]))
@@ -80,7 +80,7 @@ def test_rig_on_vcan_ends_in_order_with_ctrl_c(tmp_path: Path, patience: Patienc
             rig.close()
         assert not control.exists()
         if code == INVALID:  # drives that missed SYNC for five cycles have stopped by themselves
-            return Late(rig.printed[-300:].strip())
+            return Late(rig.printed.strip().splitlines()[-1])
         assert (len(running), is_there) == (4, True), rig.printed
         return rig
 
