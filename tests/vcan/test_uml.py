@@ -95,7 +95,8 @@ def test_boot_that_fails_shows_the_console(inside: Inside, booted: None, tmp_pat
 def test_packages_that_cannot_be_fetched_name_the_remedy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Reason and remedy, which become the reason of the skip."""
     monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(uml.VcanError, match=r"kernel that has vcan.*Debian package source.*dpkg -x.*: apt-get: .*No such file"):
+    remedy = r"kernel that has vcan.*Debian package source.*dpkg -x.*apt-get: .*No such file"
+    with pytest.raises(uml.VcanError, match=remedy):
         uml.fetch(tmp_path / "cache")
     assert sorted(path.name for path in (tmp_path / "cache").iterdir()) == ["lock"]
 

@@ -69,9 +69,9 @@ def fetch(cache: Path) -> Path:
     root = cache.resolve() / "root"
     reason = _fetch(root)
     if reason:
-        raise VcanError("User Mode Linux cannot be fetched; use a kernel that has vcan, or make a Debian package source "
-                        f"reachable, or unpack the .deb files of {' and '.join(PACKAGES)} with dpkg -x into {root}: "
-                        f"{reason}")
+        raise VcanError("User Mode Linux cannot be fetched; use a kernel that has vcan, or make a Debian package "
+                        f"source reachable, or unpack the .deb files of {' and '.join(PACKAGES)} with dpkg -x into "
+                        f"{root}: {reason}")
     if not (root / KERNEL).exists() or not list(root.glob(MODULES_AT)):
         raise VcanError(f"{root}: {KERNEL} or {MODULES_AT} is missing; delete the folder and try again")
     return root
