@@ -13,11 +13,14 @@ from typing import Final, final
 from mypy_extensions import mypyc_attr
 
 from canopen_exo.bus.frame import Frame
-from canopen_exo.bus.node import NEVER, PortState
+from canopen_exo.bus.node import MS, NEVER, PortState
 
 _COMPARISONS: Final = 3
 _COMPARED_WITHIN_NS: Final = 200_000
 """A process that is interrupted between two clocks compares them again, twice at most."""
+
+_COMPARED_FOR_NS: Final = MS
+"""How long a comparison holds: a wall clock that is being slewed drifts by 0.5 us in it (500 ppm, adjtimex(2))."""
 
 
 @final
@@ -100,19 +103,29 @@ class RecordChannel(Channel):
 class StampClock:
     """Stamps of CLOCK_REALTIME (the kernel's, python-can's) on the loop's clock.
 
-    Both clocks are compared anew for every batch, so a corrected wall clock does no harm: a stamp lies between the
-    one before it and now, whatever the wall clock did meanwhile.
-    now, offset: of the last comparison, ns; last: the stamp given last. A channel that reads many stamps at once does
-    what `at` does by itself.
+    Both clocks are compared anew for every batch, at most once a millisecond, so a corrected wall clock does no harm: a
+    stamp lies between the one before it and now, whatever the wall clock did meanwhile.
+    now: of the last `begin`; offset: what to take from a stamp, ns; last: the stamp given last. A channel that reads
+    many stamps at once does what `at` does by itself.
     """
 
     def __init__(self) -> None:
         self.now: int = 0
         self.offset: int = 0
         self.last: int = -NEVER
+        self._epoch_ns: int = 0
+        self._compare_at: int = -NEVER
 
     def begin(self, epoch_ns: int) -> int:
-        """Compare the clocks; returns now on the loop's clock [ns]."""
+        """Compare the clocks when it is time to; returns now on the loop's clock [ns]."""
+        after = time.monotonic_ns()
+        if after >= self._compare_at or epoch_ns != self._epoch_ns:
+            after = self._compare(epoch_ns)
+        self.now = after - epoch_ns
+        return self.now
+
+    def _compare(self, epoch_ns: int) -> int:
+        """Find the difference of the clocks; returns CLOCK_MONOTONIC."""
         tightest = NEVER
         for _ in range(_COMPARISONS):
             before = time.monotonic_ns()
@@ -123,8 +136,9 @@ class StampClock:
                 self.offset = wall - (before + after) // 2 + epoch_ns
             if tightest < _COMPARED_WITHIN_NS:
                 break
-        self.now = after - epoch_ns
-        return self.now
+        self._epoch_ns = epoch_ns
+        self._compare_at = after + _COMPARED_FOR_NS
+        return after
 
     def at(self, realtime_ns: int) -> int:
         """A stamp of CLOCK_REALTIME [ns] on the loop's clock."""

@@ -119,7 +119,8 @@ class RealTimeLoop:
             self._out.lines.append(self._lines[index])
             self._out.dropped.append(0)
         self.dropped: Final[list[int]] = self._out.dropped
-        self._relay: Final[Relay | None] = node if isinstance(node, Relay) and self._can_relay(ports) else None
+        self._records: Final[list[RecordChannel]] = self._record_channels(node, ports)
+        self._relay: Final[Relay | None] = node if isinstance(node, Relay) and self._records else None
         self._measure: Final[bool] = measure_latency
 
     @property
@@ -236,49 +237,50 @@ class RealTimeLoop:
             for arrival in first:
                 self._deliver(line, arrival, latest)
 
-    def _can_relay(self, ports: list[int]) -> bool:
-        """Whether records can go from channel to channel, and no trace wants frames."""
-        if self.trace is not None or ports != [0, 1] or len(self._lines) != 2:
-            return False
-        first, second = self._lines[0].channel, self._lines[1].channel
-        return isinstance(first, RecordChannel) and type(first) is type(second)
+    def _record_channels(self, node: Node, ports: list[int]) -> list[RecordChannel]:
+        """The two channels of a Relay, where records can go from one to the other and no trace wants frames."""
+        if not isinstance(node, Relay) or self.trace is not None or ports != [0, 1] or len(self._lines) != 2:
+            return []
+        channels = [line.channel for line in self._lines]
+        found = [channel for channel in channels if isinstance(channel, RecordChannel)]
+        return found if len(found) == 2 and type(found[0]) is type(found[1]) else []
 
     def _serve_records(self, relay: Relay, now: int, readable: list[int]) -> None:
         """As `_serve_arrivals`; what `relay` only passes on goes through here."""
         found: list[RecordArrival] = []
-        for line in self._lines:
-            channel = line.channel
-            if (line.fd in readable or channel.poll_at <= now) and isinstance(channel, RecordChannel):
-                batch = channel.receive_records(line.index)
+        for place, channel in enumerate(self._records):
+            if self._lines[place].fd in readable or channel.poll_at <= now:
+                batch = channel.receive_records(place)
                 if found and batch:  # each is in order by itself; where stamps are equal the first channel comes first
                     found += batch
                     found.sort(key=_BY_STAMP)
                 elif batch:
                     found = batch
-        clock, epoch_ns = self._clock, self.epoch_ns
         for stamp, place, can_id, record, arrival in found:
-            line = self._lines[place]
             if arrival is None:
-                other = self._lines[1 - place]
-                sink = other.channel
                 if (
                     relay.passes[place][can_id]
                     and not relay.is_disturbed
-                    and not other.waiting
                     and relay.wake_at >= stamp
-                    and isinstance(sink, RecordChannel)
+                    and self._pass_on(stamp, 1 - place, record)
                 ):
-                    lost = sink.lost
-                    if sink.send_record(record):
-                        relay.frames[place] += 1
-                        if stamp > self._served:
-                            self._served = stamp
-                        if self._measure and sink.lost == lost:
-                            other.latency.add(clock() - epoch_ns - stamp)
-                        continue
-                assert isinstance(line.channel, RecordChannel)
-                arrival = Arrival(stamp, line.channel.frame_in(record), None)
-            self._deliver(line, arrival, stamp)
+                    relay.frames[place] += 1
+                    continue
+                arrival = Arrival(stamp, self._records[place].frame_in(record), None)
+            self._deliver(self._lines[place], arrival, stamp)
+
+    def _pass_on(self, stamp: int, place: int, record: bytes) -> bool:
+        """Send a record on the channel `place`; False when it has to wait, as a frame."""
+        line = self._lines[place]
+        channel = self._records[place]
+        lost = channel.lost
+        if line.waiting or not channel.send_record(record):
+            return False
+        if stamp > self._served:
+            self._served = stamp
+        if self._measure and channel.lost == lost:
+            line.latency.add(self._clock() - self.epoch_ns - stamp)
+        return True
 
     def _deliver(self, line: Line, arrival: Arrival, latest: int) -> None:
         """Give one arrival to the node. latest: no stamp counts as later than this, the time at which all had come."""

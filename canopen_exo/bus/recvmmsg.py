@@ -12,6 +12,7 @@ import socket
 import struct
 import sys
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Final, final
 
 SLOTS: Final = 64
@@ -27,13 +28,15 @@ _PLAIN_SIZE: Final = 16
 """linux/can.h: struct can_frame."""
 
 _CONTROL_SIZE: Final = 64
-"""Bytes for control messages: a stamp (16 + 16) and a drop count (16 + 8)."""
+"""Bytes for control messages: a stamp (16 + 16) and a drop count (16 + 8), which comes only after a drop."""
 
 _CONTROL_HEAD: Final = struct.Struct("@Nii")  # struct cmsghdr: length with this head, level, type
 _ALIGNED: Final = struct.calcsize("N")
 _TIME: Final = struct.Struct("@ll")  # timespec
 _COUNT: Final = struct.Struct("@I")
 _STAMP_SIZE: Final = _CONTROL_HEAD.size + _TIME.size
+_STAMP_AT: Final = _CONTROL_HEAD.size
+_FIRST_STAMP: Final = _TIME.unpack_from
 _STAMPS: Final = struct.Struct(f"@{_CONTROL_HEAD.size}xll{_CONTROL_SIZE - _STAMP_SIZE}x")
 _RECORDS: Final = struct.Struct(f"{_PLAIN_SIZE}s{RECORD_SIZE - _PLAIN_SIZE}x")
 _SECOND: Final = 1_000_000_000
@@ -86,41 +89,57 @@ class Receiver:
         self.count: int = 0
         self.is_plain: bool = False
         self.drops: int = -1
-        self._call: Final = _recvmmsg()
-        self._has_call: bool = self._call is not None
+        self._socket: socket.socket | None = None
+        self._read_many: Callable[[], int] | None = None
         self._found: list[Stamped] = []  # of records that are not plain
         self._error: OSError | None = None
         self._records: Final[bytearray] = bytearray(SLOTS * RECORD_SIZE)
         self._controls: Final[bytearray] = bytearray(SLOTS * _CONTROL_SIZE)
-        # ctypes objects as arguments need no conversion, which costs as much as the call
+        self._first_record: Final = memoryview(self._records)[:_PLAIN_SIZE]
         self._slots: Final = (_Slot * SLOTS)()
         self._vectors: Final = (_Vector * SLOTS)()
         self._slots_at: Final = ctypes.c_void_p(ctypes.addressof(self._slots))
-        self._heads: Final = memoryview(self._slots).cast("B")
-        self._fresh: Final[bytes] = self._lay_out()
-        self._plain: Final[tuple[bytes, bytes]] = (self._as_plain(0), self._as_plain(socket.MSG_DONTROUTE))
+        heads = memoryview(self._slots).cast("B")
+        fresh = self._lay_out()
+        # by the number of records: the heads; as they have to be before a call, and as plain records leave them, from
+        # a bus and (MSG_DONTROUTE) from a socket of this machine
+        self._views: Final = [heads[: number * _SLOT_SIZE] for number in range(SLOTS + 1)]
+        self._fresh: Final = _beginnings(fresh)
+        self._plain: Final = _beginnings(_as_plain(fresh, 0))
+        self._plain_local: Final = _beginnings(_as_plain(fresh, socket.MSG_DONTROUTE))
 
-    def read(self, can: socket.socket) -> int:
+    def attach(self, can: socket.socket) -> None:
+        """Read from this socket from now on; no drop of it has been told yet."""
+        self.drops = -1
+        self._socket = can
+        self._error = None
+        call = _recvmmsg()
+        # all arguments made beforehand: converting them costs as much as the call
+        many = None if call is None else partial(call, can.fileno(), self._slots_at, SLOTS, socket.MSG_DONTWAIT, None)
+        self._read_many = many
+
+    def read(self) -> int:
         """Take up to `SLOTS` records without waiting; how many. Raises OSError, BlockingIOError when there is none."""
-        self.count = 0
-        self.is_plain = False
-        if self._call is None or not self._has_call:
-            return self._read_singly(can)
-        count: int = self._call(can.fileno(), self._slots_at, SLOTS, socket.MSG_DONTWAIT, None)
+        many = self._read_many
+        if many is None:
+            return self._read_singly()
+        count = many()
         if count < 0:
-            code = ctypes.get_errno()
-            if code in _MISSING:
-                self._has_call = False
-                return self._read_singly(can)
-            raise OSError(code, os.strerror(code))
+            return self._fail()
         self.count = count
-        end = count * _SLOT_SIZE
-        heads = bytes(self._heads[:end])
-        self._heads[:end] = self._fresh[:end]
-        self.is_plain = heads == self._plain[0][:end] or heads == self._plain[1][:end]
-        if not self.is_plain:
+        heads = self._views[count].tobytes()
+        if heads == self._plain[count] or heads == self._plain_local[count]:
+            self.is_plain = True  # and room is left for a stamp only: a drop count shows as truncated (MSG_CTRUNC)
+        else:
+            self.is_plain = False
+            self._views[count][:] = self._fresh[count]
             self._take_apart(heads)
         return count
+
+    def first(self) -> tuple[bytes, int, int]:
+        """The first of plain records, with its stamp: seconds and nanoseconds of CLOCK_REALTIME."""
+        seconds, nanos = _FIRST_STAMP(self._controls, _STAMP_AT)
+        return self._first_record.tobytes(), seconds, nanos
 
     def plain(self) -> Iterator[tuple[bytes]]:
         """The plain records, 16 bytes each."""
@@ -156,16 +175,7 @@ class Receiver:
             message.vector_count = 1
             message.control = ctypes.addressof(controls) + number * _CONTROL_SIZE
             message.control_size = _CONTROL_SIZE
-        return bytes(self._heads)
-
-    def _as_plain(self, flags: int) -> bytes:
-        """The heads after a call that filled every slot with a plain record. flags: as the kernel sets them."""
-        slots = (_Slot * SLOTS).from_buffer_copy(self._fresh)
-        for slot in slots:
-            slot.message.control_size = _STAMP_SIZE
-            slot.message.flags = flags
-            slot.size = _PLAIN_SIZE
-        return bytes(slots)
+        return bytes(self._slots)
 
     def _take_apart(self, heads: bytes) -> None:
         """Records of any size, with any control messages."""
@@ -196,13 +206,25 @@ class Receiver:
             self.drops = _COUNT.unpack_from(content)[0]
         return stamp
 
-    def _read_singly(self, can: socket.socket) -> int:
+    def _fail(self) -> int:
+        """What the call says when it gives nothing."""
+        self.count = 0
+        code = ctypes.get_errno()
+        if code in _MISSING:
+            self._read_many = None
+            return self._read_singly()
+        raise OSError(code, os.strerror(code))
+
+    def _read_singly(self) -> int:
+        can = self._socket
         self._found = []
+        self.count = 0
+        self.is_plain = False
         if self._error is not None:
             error, self._error = self._error, None
             raise error
         try:
-            while len(self._found) < SLOTS:
+            while can is not None and len(self._found) < SLOTS:
                 record, controls, _, _ = can.recvmsg(RECORD_SIZE, _CONTROL_SIZE, socket.MSG_DONTWAIT)
                 stamp = -1
                 for level, kind, content in controls:
@@ -218,8 +240,23 @@ class Receiver:
         return self.count
 
 
+def _as_plain(fresh: bytes, flags: int) -> bytes:
+    """The heads after a call that filled every slot with a plain record. flags: as the kernel sets them."""
+    slots = (_Slot * SLOTS).from_buffer_copy(fresh)
+    for slot in slots:
+        slot.message.control_size = _STAMP_SIZE
+        slot.message.flags = flags
+        slot.size = _PLAIN_SIZE
+    return bytes(slots)
+
+
+def _beginnings(heads: bytes) -> list[bytes]:
+    """The first heads, for every number of them."""
+    return [heads[: number * _SLOT_SIZE] for number in range(SLOTS + 1)]
+
+
 def _recvmmsg() -> Callable[..., int] | None:
-    """The C library's function; None where there is none."""
+    """The C library's function, which never waits and so keeps the interpreter's lock; None where there is none."""
     if sys.platform != "linux":
         return None
-    return getattr(ctypes.CDLL(None, use_errno=True), "recvmmsg", None)
+    return getattr(ctypes.PyDLL(None, use_errno=True), "recvmmsg", None)
