@@ -168,7 +168,7 @@ class RealTimeLoop:
         writers: list[int] = []
         timeout_ns = self._prepare(self.now(), readers, writers)
         readable, writable = self._wait(readers, writers, timeout_ns / SECOND)
-        now = self.now()
+        now = self._clock() - self.epoch_ns
         if self._relay is None:
             self._serve_arrivals(now, readable)
         else:
@@ -248,7 +248,9 @@ class RealTimeLoop:
     def _serve_records(self, relay: Relay, now: int, readable: list[int]) -> None:
         """As `_serve_arrivals`; what `relay` only passes on goes through here."""
         found: list[RecordArrival] = []
-        for place, channel in enumerate(self._records):
+        place = -1
+        for channel in self._records:
+            place += 1
             if self._lines[place].fd in readable or channel.poll_at <= now:
                 batch = channel.receive_records(place)
                 if found and batch:  # each is in order by itself; where stamps are equal the first channel comes first
@@ -273,8 +275,10 @@ class RealTimeLoop:
         """Send a record on the channel `place`; False when it has to wait, as a frame."""
         line = self._lines[place]
         channel = self._records[place]
+        if line.waiting:
+            return False
         lost = channel.lost
-        if line.waiting or not channel.send_record(record):
+        if not channel.send_record(record):
             return False
         if stamp > self._served:
             self._served = stamp

@@ -113,7 +113,7 @@ class Receiver:
         self.drops = -1
         self._socket = can
         self._error = None
-        call = _recvmmsg()
+        call = find_recvmmsg()
         # all arguments made beforehand: converting them costs as much as the call
         many = None if call is None else partial(call, can.fileno(), self._slots_at, SLOTS, socket.MSG_DONTWAIT, None)
         self._read_many = many
@@ -255,7 +255,7 @@ def _beginnings(heads: bytes) -> list[bytes]:
     return [heads[: number * _SLOT_SIZE] for number in range(SLOTS + 1)]
 
 
-def _recvmmsg() -> Callable[..., int] | None:
+def find_recvmmsg() -> Callable[..., int] | None:
     """The C library's function, which never waits and so keeps the interpreter's lock; None where there is none."""
     if sys.platform != "linux":
         return None

@@ -39,6 +39,7 @@ _HEAD_SIZE: Final = 8
 _CLASSICAL: Final = struct.Struct("=IBBBB8s")
 _FLEXIBLE: Final = struct.Struct("=IBBBB64s")
 _ID: Final = struct.Struct("=I")
+_LENGTH_AT: Final = 4
 _ID_LENGTH: Final = struct.Struct("=IB67x")
 
 # Not all of these are in Python's socket module; the values are those of asm-generic/socket.h (all but alpha, mips,
@@ -211,12 +212,7 @@ class SocketCanChannel(RecordChannel):
                 if self._receiver.is_plain and not self._is_down:
                     if count == 1:  # what a bus that is not crowded gives; a frame waits for this
                         record, seconds, nanos = self._receiver.first()
-                        stamp = self._stamps.at(seconds * SECOND + nanos)
-                        (can_id,) = _ID.unpack_from(record)
-                        if can_id <= 0x7FF and record[4] <= 8:
-                            found.append((stamp, place, can_id, record, None))
-                        else:
-                            self._take(record, stamp, place, found)
+                        self._take(record, self._stamps.at(seconds * SECOND + nanos), place, found)
                     else:
                         self._take_plain(place, now, found)
                 else:
@@ -316,6 +312,11 @@ class SocketCanChannel(RecordChannel):
 
     def _take(self, record: bytes, stamp: int, place: int, found: list[RecordArrival]) -> None:
         """One record of any kind."""
+        if len(record) == CLASSICAL_SIZE:
+            (can_id,) = _ID.unpack_from(record)
+            if can_id <= 0x7FF and record[_LENGTH_AT] <= 8:
+                found.append((stamp, place, can_id, record, None))
+                return
         frame = decode(record)
         if frame is not None:
             found.append((stamp, place, -1, b"", Arrival(stamp, frame, None)))
