@@ -13,13 +13,14 @@ own forwarding, cangw, is measured with them; `--vcan vcan0,vcan1` names the int
 - Latency: from sending a frame to the kernel's stamp of it on the other bus, median, at the rate of a full bus; a round
   in which a program loses a frame does not count for it.
 
-The forwarder has one core to itself and this process another, where there are two. More cores would not help can_bridge:
-its two threads share the interpreter's lock and cost more each when they run on two. Of the rounds the best counts, for
+The forwarder has one core to itself and this process another, where there are two. More cores would not help
+can_bridge: its two threads share the interpreter's lock and cost more on two. Of the rounds the best counts, for
 every program and figure: what others on the machine take away is not the program's. How busy forwarder and this process
 were at saturation is printed; where a forwarder did not have its core (BUSY), the throughput is not judged.
 Nothing is asserted about time: the budgets stand beside the figures.
 
-Usage: python -m benchmarks.bench_gateway [--rounds N] [--frames N] [--rate N] [--saturation S] [--seconds S] [--vcan A,B | --no-vcan]
+Usage: python -m benchmarks.bench_gateway [--rounds N] [--frames N] [--rate N] [--saturation S] [--seconds S]
+           [--full-bus-only] [--vcan A,B | --no-vcan]
 """
 
 import argparse
