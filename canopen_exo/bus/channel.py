@@ -15,9 +15,9 @@ from mypy_extensions import mypyc_attr
 from canopen_exo.bus.frame import Frame
 from canopen_exo.bus.node import MS, NEVER, PortState
 
-_COMPARISONS: Final = 3
-_COMPARED_WITHIN_NS: Final = 200_000
-"""A process that is interrupted between two clocks compares them again, twice at most."""
+_COMPARISONS: Final = 5
+_COMPARED_WITHIN_NS: Final = 5_000
+"""A process that is interrupted between two clocks compares them again, four times at most; the closest counts."""
 
 _COMPARED_FOR_NS: Final = MS
 """How long a comparison holds: a wall clock that is being slewed drifts by 0.5 us in it (500 ppm, adjtimex(2))."""

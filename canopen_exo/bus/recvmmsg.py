@@ -83,12 +83,14 @@ class Receiver:
 
     count: records of the last `read`. is_plain: all of them are classical (16 bytes), stamped, and told of no drop;
     `plain` and `stamps` have them then, `stamped` in any case. drops: the running total last told, -1 for none.
+    is_untold: with a record that was not plain there was more to tell, of drops, than there was room for.
     """
 
     def __init__(self) -> None:
         self.count: int = 0
         self.is_plain: bool = False
         self.drops: int = -1
+        self.is_untold: bool = False
         self._socket: socket.socket | None = None
         self._read_many: Callable[[], int] | None = None
         self._found: list[Stamped] = []  # of records that are not plain
@@ -180,8 +182,11 @@ class Receiver:
     def _take_apart(self, heads: bytes) -> None:
         """Records of any size, with any control messages."""
         self._found = []
+        self.is_untold = False
         for number in range(self.count):
             slot = _Slot.from_buffer_copy(heads, number * _SLOT_SIZE)
+            if slot.message.flags & socket.MSG_CTRUNC:
+                self.is_untold = True
             at = number * _CONTROL_SIZE
             stamp = self._controls_in(self._controls[at : at + min(slot.message.control_size, _CONTROL_SIZE)])
             at = number * RECORD_SIZE

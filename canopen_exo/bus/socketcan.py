@@ -309,6 +309,8 @@ class SocketCanChannel(RecordChannel):
             self._take(record, stamp, place, found)
         if receiver.drops >= 0:
             self._count_drops(receiver.drops)
+        if receiver.is_untold:
+            self.count_overruns()
 
     def _take(self, record: bytes, stamp: int, place: int, found: list[RecordArrival]) -> None:
         """One record of any kind."""
