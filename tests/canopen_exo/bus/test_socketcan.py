@@ -246,14 +246,16 @@ def test_receive_drains_in_order_with_kernel_stamps(wire: Wire) -> None:
 def test_stamps_of_a_batch_differ(wire: Wire) -> None:
     """They are the kernel's, one for each frame, not the time of reading.
 
-    Interrupted between reading two clocks, a process cannot tell them apart: such stamps are all "not later than now".
+    The kernel begins to stamp a moment after it was first asked to (net_enable_timestamp defers it), until when stamps
+    are of reading, later than now and so cut to it: hence again and again; on a busy machine that moment is long.
     """
-    for _ in range(100):
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline:
         for _ in range(20):
             wire.feed(encode(FRAME))
         if len({arrival.stamp_ns for arrival in wire.channel.receive()}) > 1:
             return
-    pytest.fail("a hundred batches, and in each of them all stamps are the same")
+    pytest.fail("for a minute all stamps of every batch were the same")
 
 
 def test_send_hands_the_record_over(wire: Wire) -> None:
