@@ -27,7 +27,7 @@ from typing import Final, final
 from mypy_extensions import mypyc_attr
 
 from canopen_exo.bus.frame import Frame
-from canopen_exo.bus.node import MS, NEVER, ErrorState, Node, Out, PortState
+from canopen_exo.bus.node import MS, NEVER, ErrorState, Out, PortState, Relay
 from canopen_exo.plan import HLC_STATUS, STATUS_MOTION, STATUS_STOPPED, SYNC
 from fi_gateway.errors import FaultError
 from fi_gateway.injector import ACTIVE, ARMED, WAITING, Activation, Injector, graph_order
@@ -51,7 +51,7 @@ _STATE: Final = (
     "_states",
     "_away",
     "_probe_at",
-    "_is_disturbed",
+    "is_disturbed",
 )
 """What `__reduce__` copies besides the constructor arguments; the routes are laid afresh, and what is attached stays
 with the original."""
@@ -122,7 +122,7 @@ class CommandPort:
 
 
 @final
-class Gateway(Node):
+class Gateway(Relay):
     """Two ports: CONTROLLER_PORT and DRIVE_PORT. What comes in on one goes out on the other.
 
     injectors: in the order in which their faults apply; cycle_ns: SYNC period, ns.
@@ -138,7 +138,6 @@ class Gateway(Node):
         if cycle_ns <= 0:
             raise FaultError(f"gateway: SYNC period {cycle_ns} ns given, allowed 1 ns and more")
         self.injectors: Final[list[Injector]] = list(injectors)
-        self.frames: list[int] = [0, 0]
         self.lost: list[int] = [0, 0]
         self.undelivered: list[int] = [0, 0]
         self.notices: list[int] = [0, 0]
@@ -155,7 +154,6 @@ class Gateway(Node):
         self._states: list[ErrorState] = [ErrorState.ERROR_ACTIVE, ErrorState.ERROR_ACTIVE]
         self._away: list[bool] = [False, False]
         self._probe_at: list[int] = [0, 0]
-        self._is_disturbed: bool = False
         self._links: Final[list[_Link]] = _links(injectors)
         self._from_controller: Final[list[_Route | None]] = [None] * 0x800
         self._from_drives: Final[list[_Route | None]] = [None] * 0x800
@@ -180,7 +178,7 @@ class Gateway(Node):
                     self.lost[port] += 1
                     return
                 frame = left
-        if self._is_disturbed and not self._can_send(now, port, out):
+        if self.is_disturbed and not self._can_send(now, port, out):
             self.undelivered[port] += 1
             return
         out.send(1 - port, frame)
@@ -244,6 +242,7 @@ class Gateway(Node):
         self.injectors.append(injector)
         self._links[:] = links
         self._lay_route(injector)
+        self._note_passes()
         base_ns = now if at_once else self.time_zero
         if base_ns != NEVER:
             enabled, injector.enabled = injector.enabled, False
@@ -263,6 +262,7 @@ class Gateway(Node):
         self._commands = commands
         table = self._from_drives if commands.port == DRIVE_PORT else self._from_controller
         table[commands.cob_id] = _Route(_COMMAND)
+        self._note_passes()
 
     def __reduce__(self) -> tuple[type["Gateway"], tuple[list[Injector], int], dict[str, object]]:
         state = {name: getattr(self, name) for name in _STATE}
@@ -281,6 +281,13 @@ class Gateway(Node):
                     _route(self._from_drives, cob_id)
                 return
         self._power_up = 0
+        self._note_passes()
+
+    def _note_passes(self) -> None:
+        """Say which frames need nothing from here."""
+        for port, table in ((CONTROLLER_PORT, self._from_controller), (DRIVE_PORT, self._from_drives)):
+            for cob_id, route in enumerate(table):
+                self.passes[port][cob_id] = 1 if route is None else 0
 
     def _lay_route(self, injector: Injector) -> None:
         for cob_id in sorted(set(injector.target.cob_ids)):
@@ -296,6 +303,7 @@ class Gateway(Node):
             for cob_id, route in enumerate(table):
                 if route is not None and route.kind == _PLAIN and not route.injectors:
                     table[cob_id] = None
+        self._note_passes()
         for injector in self.injectors:
             if injector.from_power_up:
                 injector.start(now)
@@ -367,7 +375,7 @@ class Gateway(Node):
                     self._records.append(opened)
                     if self._commands is not None:
                         self._unreported.append(opened)
-                        self._is_disturbed = True
+                        self.is_disturbed = True
 
     def _schedule(self) -> None:
         """Note when something is due next, and whether an injector waits for a frame."""
@@ -386,7 +394,7 @@ class Gateway(Node):
             self.port_changes.append(PortChange(now, port, state, cause))
         self._away[port] = state is ErrorState.BUS_OFF or state is ErrorState.DOWN
         self._probe_at[port] = now + _PROBE_NS
-        self._is_disturbed = self._away[0] or self._away[1] or len(self._unreported) > 0
+        self.is_disturbed = self._away[0] or self._away[1] or len(self._unreported) > 0
 
     def _can_send(self, now: int, port: int, out: Out) -> bool:
         """Whether a frame that came in on `port` at `now` may go out on the other; says first what is unreported."""
@@ -407,7 +415,7 @@ class Gateway(Node):
         if self._commands is not None:
             self._commands.report(self._unreported, out)
         self._unreported = []
-        self._is_disturbed = self._away[0] or self._away[1]
+        self.is_disturbed = self._away[0] or self._away[1]
 
 
 def _route(table: list[_Route | None], cob_id: int) -> _Route:
