@@ -273,6 +273,19 @@ def statistics_text(directions: list[Direction]) -> str:
     return "\n".join(lines)
 
 
+def latency_text(directions: list[Direction]) -> str:
+    """Histogram of the added latency, one line for each direction that has one: octaves of ns, told by upper edge."""
+    lines = []
+    for one in directions:
+        octaves: dict[int, int] = {}
+        for lower, number in one.latency.document()["bins"] if one.latency is not None else ():
+            octaves[lower.bit_length()] = octaves.get(lower.bit_length(), 0) + number
+        if octaves:
+            parts = [f"{number} up to {2**bits / 1e3:.3g} us" for bits, number in sorted(octaves.items())]
+            lines.append(f"{one.direction}: added latency of {', '.join(parts)}")
+    return "\n".join(lines)
+
+
 def listing_text(rows: list[InjectorRow], now: int) -> str:
     """One line for each injector, for people. now: loop clock, ns."""
     width = max((len(row.name) for row in rows), default=0)

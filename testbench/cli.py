@@ -76,7 +76,7 @@ def _parser() -> argparse.ArgumentParser:
     run.set_defaults(verb=_run)
 
     check = verbs.add_parser("check", help="validate a scenario and say what it will do", description=_check.__doc__)
-    check.add_argument("scenario", type=Path, metavar="FILE", help="a scenario file")
+    check.add_argument("scenario", type=Path, metavar="FILE", help="a scenario, or faults for `exo-hil gateway`")
     check.add_argument("--seed", metavar="N", help="instead of the scenario's seed")
     check.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="overrides", help="as for run")
     check.set_defaults(verb=_check)
@@ -178,20 +178,21 @@ def _real_time_buses(options: argparse.Namespace) -> tuple[str, str] | None:
 
 
 def _check(options: argparse.Namespace) -> int:
-    """Validate a scenario file and say in words what it will do; nothing is run."""
+    """Validate a scenario, or a file of faults for the gateway, and say in words what it will do; nothing is run."""
     from fi_gateway.marked_yaml import FileErrors
-    from testbench.scenario import describe, load_scenario
+    from testbench.fault_file import FaultFile, describe_faults, load_any
+    from testbench.scenario import describe
 
     overrides = list(options.overrides)
     if options.seed is not None:
         overrides.append(f"seed={options.seed}")
     try:
-        scenario = load_scenario(options.scenario, overrides)
+        found = load_any(options.scenario, overrides)
     except FileErrors as error:
         _say(_as_typed(error, options))
         return USAGE
-    _print("\n".join(describe(scenario)) + "\n")
-    for warning in scenario.warnings:
+    _print("\n".join(describe_faults(found) if isinstance(found, FaultFile) else describe(found)) + "\n")
+    for warning in found.warnings:
         _say(f"warning: {warning}")
     return PASS
 

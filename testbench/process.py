@@ -172,6 +172,7 @@ def joints_main(scenario: "Scenario", bus: str, options: ProcessOptions) -> int:
     rack = build_rack(params, build_mechanics(params))
     with session("joints", rack, [bus], [0] * len(rack.devices), options) as process:
         rack.step_at = rack.wake_at = process.start_ns
+        say("joints", f"{len(rack.devices)} drives on {bus}")
 
         def over(now: int) -> bool:
             if options.part is None:
@@ -195,6 +196,7 @@ def hlc_main(scenario: "Scenario", bus: str, options: ProcessOptions, endless: b
     duration_ns = 0 if endless else params.duration_ns
     with session("hlc", master, [bus], [0], options) as process:
         master.wake_at = master.supervise_at = process.start_ns
+        say("hlc", f"controller on {bus}")
         give_up_at = NEVER
 
         def over(now: int) -> bool:

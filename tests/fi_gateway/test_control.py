@@ -17,7 +17,15 @@ from canopen_exo.bus.node import MS, NEVER, SECOND, ErrorState, Out, PortState
 from canopen_exo.signal import Signal
 from fi_gateway import bus_control as wire
 from fi_gateway.bus_control import BusControl, Command, Status, read_command, read_status
-from fi_gateway.control import ControlRow, LiveControl, listing_text, perform, statistics, statistics_text
+from fi_gateway.control import (
+    ControlRow,
+    LiveControl,
+    latency_text,
+    listing_text,
+    perform,
+    statistics,
+    statistics_text,
+)
 from fi_gateway.effects import ConstantTime, Effect, Infinite, Once
 from fi_gateway.errors import FaultError
 from fi_gateway.events import At, Event, Never
@@ -384,6 +392,17 @@ def test_statistics_are_by_direction() -> None:
         "to_drives: 3 frames, 0 lost by faults, added latency: median 130 us, 99 % 130 us, worst 130 us",
         "to_controller: 1 frames, 1 lost by faults, 1 error notices",
     ]
+
+
+def test_histogram_of_the_added_latency_is_said_in_octaves() -> None:
+    """For people, at the gateway's end; a direction in which nothing was measured has none."""
+    to_drives = Lateness()
+    for delay_ns in (0, 900, 1023, 1024, 130_000, 131_071, 131_072):
+        to_drives.add(delay_ns)
+    drives, controller = statistics(live().gateway, [Lateness(), to_drives])
+    assert latency_text([drives, controller]) == (
+        "to_drives: added latency of 1 up to 0.001 us, 2 up to 1.02 us, 1 up to 2.05 us, 2 up to 131 us, 1 up to 262 us"
+    )
 
 
 # ---- frames on the bus --------------------------------------------------------------------------------------------
