@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
-from testbench.cli_rig import add_rig_options, add_verbs, named_buses
+from testbench.cli_rig import CONTROL_ADDRESS, HUB_ADDRESS, add_rig_options, add_verbs, named_buses
 
 PASS: Final = 0
 FAIL: Final = 1
@@ -140,8 +140,10 @@ def _run(options: argparse.Namespace) -> int:
             if options.realtime:
                 from testbench.realtime_run import run_realtime
 
+                without = frozenset(options.without)
+                places = _places(options, without)
                 result = run_realtime(
-                    scenario, buses, frozenset(options.without), fifo=options.fifo, progress=progress
+                    scenario, buses, without, fifo=options.fifo, places=places, progress=progress, announce=_say
                 )
             else:
                 from testbench.run import run_scenario
@@ -167,13 +169,20 @@ def _run(options: argparse.Namespace) -> int:
     return PASS if result.judgement.passed else FAIL
 
 
+def _places(options: argparse.Namespace, without: frozenset[str]) -> tuple[str, str]:
+    """Where hub and live control listen: where foreign software looks for them, else on a free port and in a folder."""
+    listen = options.listen or (HUB_ADDRESS if without else "127.0.0.1:0")
+    return listen, options.control or (CONTROL_ADDRESS if "hlc" in without else "")
+
+
 def _real_time_buses(options: argparse.Namespace) -> tuple[str, str] | None:
     """The buses named; raises BenchError when something of real time is given without --realtime."""
     from testbench.errors import BenchError
 
     buses = named_buses(options)
-    if not options.realtime and (buses or options.without or options.fifo):
-        raise BenchError("--controller-bus, --drive-bus, --without and --fifo are of real time; add --realtime")
+    if not options.realtime and (buses or options.without or options.fifo or options.listen or options.control):
+        real_time = "--controller-bus, --drive-bus, --without, --listen, --control and --fifo"
+        raise BenchError(f"{real_time} are of real time; add --realtime")
     return buses
 
 

@@ -22,6 +22,7 @@ INVALID: Final = 3
 
 PARTS: Final = ("joints", "gateway", "hlc")
 
+HUB_ADDRESS: Final = "127.0.0.1:29536"
 CONTROL_ADDRESS: Final = "127.0.0.1:29537"
 NAMED: Final = ("arm", "disarm", "trigger")
 UNNAMED: Final = ("start", "stop", "resume")
@@ -50,12 +51,6 @@ def add_verbs(verbs: Verbs) -> None:
     up = verbs.add_parser("up", help="the whole rig as real-time processes until Ctrl-C", description=_up.__doc__)
     _add_scenario(up)
     add_rig_options(up)
-    up.add_argument(
-        "--listen", metavar="HOST:PORT", default="127.0.0.1:29536", help="of the own hub (default: %(default)s)"
-    )
-    up.add_argument(
-        "--control", metavar="ADDRESS", default=CONTROL_ADDRESS, help="of the gateway (default: %(default)s)"
-    )
     up.add_argument("--no-faults", action="store_true", help="without the scenario's injectors")
     up.set_defaults(verb=_up)
 
@@ -103,11 +98,11 @@ def add_verbs(verbs: Verbs) -> None:
 
     hub = verbs.add_parser("hub", help="an emulated bus for machines without CAN", description=_hub.__doc__)
     hub.add_argument(
-        "--listen", metavar="HOST:PORT", default="127.0.0.1:29536", help="port 0: a free one (default: %(default)s)"
+        "--listen", metavar="HOST:PORT", default=HUB_ADDRESS, help="port 0: a free one (default: %(default)s)"
     )
     hub.add_argument("--timed", action="store_true", help="with bit time and arbitration of a real bus")
     hub.add_argument("--bitrate", type=int, default=1_000_000, metavar="N", help="with --timed (default: %(default)s)")
-    hub.add_argument("--supervisor", type=int, default=0, help=argparse.SUPPRESS)
+    _add_supervisor(hub)
     hub.set_defaults(verb=_hub)
 
 
@@ -123,6 +118,9 @@ def add_rig_options(parser: argparse.ArgumentParser) -> None:
         metavar="PART",
         help="leave joints, gateway or hlc to foreign software on the same buses; may be repeated",
     )
+    known = "where others must find it; else any free one"
+    parser.add_argument("--listen", metavar="HOST:PORT", help=f"of the own hub (default: {HUB_ADDRESS} {known})")
+    parser.add_argument("--control", metavar="ADDRESS", help=f"of the gateway (default: {CONTROL_ADDRESS} {known})")
     parser.add_argument("--fifo", action="store_true", help="real-time scheduling (SCHED_FIFO), where permitted")
 
 
@@ -158,7 +156,13 @@ def _add_process(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--epoch", type=int, default=0, metavar="NS", help="CLOCK_MONOTONIC at time 0 of the rig")
     parser.add_argument("--part", type=Path, metavar="FILE", help="leave this process's part of the result there")
     parser.add_argument("--fifo", action="store_true", help="real-time scheduling (SCHED_FIFO), where permitted")
+    _add_supervisor(parser)
+
+
+def _add_supervisor(parser: argparse.ArgumentParser) -> None:
+    """For processes of a supervised rig: who that is, and the rig's folder, which goes when he is gone."""
     parser.add_argument("--supervisor", type=int, default=0, help=argparse.SUPPRESS)
+    parser.add_argument("--folder", type=Path, default=None, help=argparse.SUPPRESS)
 
 
 def _joints(options: argparse.Namespace) -> int:
@@ -205,13 +209,15 @@ def _served(serve: Callable[["ProcessOptions"], int], options: argparse.Namespac
     """Serve, and say what went wrong in one line."""
     from canopen_exo.errors import CanopenExoError
     from fi_gateway.errors import FaultError
-    from testbench.process import ProcessOptions
+    from testbench.process import ProcessOptions, remove_orphaned
 
     try:
         return serve(ProcessOptions(options.epoch, options.part, options.fifo, options.supervisor))
     except (BenchError, CanopenExoError, FaultError) as error:
         print(error, file=sys.stderr)
         return USAGE
+    finally:
+        remove_orphaned(options.folder, options.supervisor)
 
 
 def _read_faults(options: argparse.Namespace) -> "FaultFile | None":
@@ -262,15 +268,17 @@ def _bus(given: str | None, role: str) -> str:
 def _hub(options: argparse.Namespace) -> int:
     """A CAN bus over TCP: everything that connects to the same name is on the same bus. Prints where it listens."""
     from canopen_exo.bus.hub import hub_main
-    from testbench.process import die_with
+    from testbench.process import die_with, remove_orphaned
 
     try:
         if options.supervisor:
             die_with(options.supervisor)
+        return hub_main(options.listen, options.timed, options.bitrate)
     except BenchError as error:
         print(f"hub: {error}", file=sys.stderr)
         return USAGE
-    return hub_main(options.listen, options.timed, options.bitrate)
+    finally:
+        remove_orphaned(options.folder, options.supervisor)
 
 
 def _fault(options: argparse.Namespace) -> int:
@@ -298,8 +306,9 @@ def _fault(options: argparse.Namespace) -> int:
 def _up(options: argparse.Namespace) -> int:
     """Start hub, joints, gateway and controller, walk until Ctrl-C, and stop them in order."""
     from canopen_exo.errors import CanopenExoError
+    from testbench.child import ProcessError
     from testbench.live import run_up
-    from testbench.supervisor import ProcessError, Setup
+    from testbench.supervisor import Setup
 
     scenario = read_scenario(options)
     if scenario is None:
@@ -312,8 +321,8 @@ def _up(options: argparse.Namespace) -> int:
             faults=not options.no_faults,
             endless=True,
             fifo=options.fifo,
-            listen=options.listen,
-            control=options.control,
+            listen=options.listen or HUB_ADDRESS,
+            control=options.control or CONTROL_ADDRESS,
         )
         return run_up(setup)
     except ProcessError as error:

@@ -9,6 +9,7 @@ process that needs it.
 
 import ctypes
 import os
+import shutil
 import signal
 import sys
 import time
@@ -273,6 +274,12 @@ def die_with(supervisor: int) -> None:
         ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
     if os.getppid() != supervisor:
         raise BenchError(f"the supervisor (process {supervisor}) is gone; start this process by itself or with `up`")
+
+
+def remove_orphaned(folder: Path | None, supervisor: int) -> None:
+    """Remove the folder of a rig whose supervisor was killed; the last of its processes to end leaves nothing."""
+    if folder is not None and supervisor and os.getppid() != supervisor:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def say(name: str, text: str) -> None:

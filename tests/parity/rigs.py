@@ -12,9 +12,10 @@ import pytest
 
 from canopen_exo import plan as ids
 from canopen_exo.bus.node import MS, NEVER, SECOND
+from testbench.child import ProcessError
 from testbench.parts import HlcPart, JointsPart, read_gateway, read_hlc, read_joints
 from testbench.scenario import JOINT_NAMES
-from testbench.supervisor import REACT_NS, ProcessError, Setup, Supervisor
+from testbench.supervisor import REACT_NS, Setup, Supervisor
 from tests.parity.patience import Late, Patience, distributions
 from tests.parity.walks import Bench
 
