@@ -122,6 +122,10 @@ def _run(options: argparse.Namespace) -> int:
     try:
         scenario = load_scenario(options.scenario, overrides)
         buses = _real_time_buses(options)
+        if options.realtime:
+            from testbench.realtime_run import check_expectations
+
+            check_expectations(scenario, frozenset(options.without))
         folder = options.out or default_folder(scenario.name, scenario.seed, options.overrides)
         check_folder(folder)
     except (FileErrors, BenchError) as error:

@@ -62,7 +62,7 @@ def run_realtime(
     places: where own hub and live control listen, see Setup; announce: told what foreign software is waited for.
     Raises BenchError when a run gives nothing to judge: a process died, a part is missing, the motion never began.
     """
-    _check_expectations(scenario, without)
+    check_expectations(scenario, without)
     started = time.perf_counter()
     listen, control = places
     setup = Setup(
@@ -203,8 +203,8 @@ def _gather(rig: Supervisor, setup: Setup) -> RealTimeRun:
     return RealTimeRun(record, timing)
 
 
-def _check_expectations(scenario: Scenario, without: frozenset[str]) -> None:
-    """A foreign controller does not say what it follows, a foreign gateway not what it did."""
+def check_expectations(scenario: Scenario, without: frozenset[str]) -> None:
+    """A foreign controller does not say what it follows, a foreign gateway not what it did: raises BenchError."""
     for line in scenario.expect:
         needed = ""
         if "hlc" in without and line.path.startswith("golden.tracking_rmse"):
