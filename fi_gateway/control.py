@@ -281,9 +281,14 @@ def latency_text(directions: list[Direction]) -> str:
         for lower, number in one.latency.document()["bins"] if one.latency is not None else ():
             octaves[lower.bit_length()] = octaves.get(lower.bit_length(), 0) + number
         if octaves:
-            parts = [f"{number} up to {2**bits / 1e3:.3g} us" for bits, number in sorted(octaves.items())]
-            lines.append(f"{one.direction}: added latency of {', '.join(parts)}")
+            parts = [f"<= {_edge_text(2**bits)}: {number}" for bits, number in sorted(octaves.items())]
+            lines.append(f"{one.direction}: frames by added latency: {', '.join(parts)}")
     return "\n".join(lines)
+
+
+def _edge_text(edge_ns: int) -> str:
+    """An edge of the histogram, in two or three digits."""
+    return f"{edge_ns / 1e3:.2g} us" if edge_ns < 100_000 else f"{edge_ns / 1e6:.2g} ms"
 
 
 def listing_text(rows: list[InjectorRow], now: int) -> str:

@@ -401,7 +401,7 @@ def test_histogram_of_the_added_latency_is_said_in_octaves() -> None:
         to_drives.add(delay_ns)
     drives, controller = statistics(live().gateway, [Lateness(), to_drives])
     assert latency_text([drives, controller]) == (
-        "to_drives: added latency of 1 up to 0.001 us, 2 up to 1.02 us, 1 up to 2.05 us, 2 up to 131 us, 1 up to 262 us"
+        "to_drives: frames by added latency: <= 0.001 us: 1, <= 1 us: 2, <= 2 us: 1, <= 0.13 ms: 2, <= 0.26 ms: 1"
     )
 
 
