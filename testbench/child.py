@@ -29,6 +29,7 @@ class Process:
         self.name: Final[str] = name
         self.lines: Final[deque[str]] = deque(maxlen=_LAST_LINES)
         self.is_told: bool = False
+        self._first: Final[list[str]] = []
         self._say: Final[Callable[[str], None]] = say
         self._rest: bytes = b""
         self._is_closed: bool = False
@@ -75,10 +76,19 @@ class Process:
             for line in lines:
                 text = line.decode(errors="replace").rstrip()
                 self.lines.append(text)
+                if len(self._first) < _LAST_LINES:
+                    self._first.append(text)
                 self._say(text)
             if not data:
                 return False
         return False
+
+    def said(self, start: str) -> str:
+        """The rest of the first line it printed with that start; "" when none of its first and last lines has it."""
+        for line in (*self._first, *self.lines):
+            if line.startswith(start):
+                return line.removeprefix(start)
+        return ""
 
     def tell(self, number: int) -> None:
         """Send it a signal; from now on its end is expected."""

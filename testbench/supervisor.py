@@ -43,6 +43,10 @@ REACT_NS: Final = SECOND
 END_NS: Final = 10 * SECOND
 """Most that a process may take to end in order, its part of the result included."""
 
+SAYS_HUB: Final = "listening on "
+SAYS_CONTROL: Final = "gateway: live control at "
+"""How hub and gateway say where they listen."""
+
 _LOOK_NS: Final = 20 * MS
 
 
@@ -143,14 +147,11 @@ class Supervisor:
         bitrate = str(self.setup.scenario.plan.bitrate)
         arguments = ["--timed", "--listen", self.setup.listen, "--bitrate", bitrate, *self._supervised()]
         hub = self._spawn("hub", arguments)
-        said = "listening on "
         limit = self.now() + READY_NS
         while not self._hub_address:
             self._check_orders()
             self._idle(hub)
-            for line in hub.lines:
-                if line.startswith(said):
-                    self._hub_address = line.removeprefix(said)
+            self._hub_address = hub.said(SAYS_HUB)
             if not self._hub_address and (hub.code is not None or self.now() >= limit):
                 raise ProcessError(f"the hub does not listen: {hub.obituary()}")
 
@@ -190,6 +191,10 @@ class Supervisor:
         """Of the gateway's live control; "" when there is none."""
         if "gateway" in self.setup.without:
             return ""
+        gateway = self.processes.get("gateway")
+        said = "" if gateway is None else gateway.said(SAYS_CONTROL)  # the port that was free, where 0 is asked for
+        if said:
+            return said
         if self.setup.control or os.name != "posix":
             return self.setup.control
         return str(Path(self._temporary.name) / "control")

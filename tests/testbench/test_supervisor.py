@@ -108,7 +108,8 @@ def test_up_ends_with_all_its_processes(
 
 def attempt_up(folder: Path, number: signal.Signals) -> int | Late:
     """Start `up`, send it a signal when it runs, see all its processes end; its exit code."""
-    arguments = ["up", "rig.yaml", "--listen", "127.0.0.1:0", "--control", str(folder / "control")]
+    control = "127.0.0.1:0" if number is signal.SIGINT else str(folder / "control")
+    arguments = ["up", "rig.yaml", "--listen", "127.0.0.1:0", "--control", control]
     up = subprocess.Popen(
         [sys.executable, "-m", "testbench.cli", *arguments],
         cwd=folder,
@@ -138,6 +139,8 @@ def attempt_up(folder: Path, number: signal.Signals) -> int | Late:
         return Late("".join(said)[-300:])
     assert len(children) == 4, said
     assert any(re.match(r"controller bus: hub:127\.0\.0\.1:\d+/controller", line) for line in said)
+    where = control.replace(":0", r":[1-9]\d*")  # the port that was free
+    assert any(re.match(rf"live control: exo-hil fault list --at {where}$", line) for line in said)
     return code
 
 
