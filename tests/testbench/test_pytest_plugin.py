@@ -145,6 +145,36 @@ def test_a_wrong_marker_fails_its_test_in_one_line(pytester: pytest.Pytester, ma
     result.assert_outcomes(passed=1, errors=1)
     result.stdout.fnmatch_lines([f"exo: {words}".replace("[", "[[]")])
     result.stdout.no_fnmatch_line("*hooks.py*")
+    result.stdout.no_fnmatch_line("*During handling*")
+
+
+@pytest.mark.parametrize(
+    ("options", "words"), [(["--exo-bus=hub"], "start `exo-hil hub --timed`*"), ([], "name a bus*")]
+)
+def test_a_foreign_part_needs_buses_that_others_can_find(
+    pytester: pytest.Pytester, options: list[str], words: str
+) -> None:
+    """Neither virtual time nor the hub of one test can be reached; what can is said."""
+    pytester.makepyfile("def test_rig(exo): pass")
+    result = run(pytester, "--exo-without=hlc", *options)
+    result.assert_outcomes(errors=1)
+    result.stdout.fnmatch_lines([f"exo: --exo-without hlc: *{words}"])
+
+
+def test_a_duration_without_a_unit_is_refused_with_the_form_that_is_allowed(pytester: pytest.Pytester) -> None:
+    """As in a scenario file: 0.1 of what?"""
+    pytester.makepyfile("def test_rig(exo): exo.run_for(0.1)")
+    result = run(pytester)
+    result.assert_outcomes(failed=1)
+    result.stdout.fnmatch_lines(["E*duration 0.1 given, allowed is text with a unit: '0.1 s', '15 cycles'"])
+
+
+def test_time_0_that_the_controller_has_said_cannot_be_said_again(pytester: pytest.Pytester) -> None:
+    """`exo.gateway.start()` is for foreign controllers."""
+    pytester.makepyfile("def test_rig(exo):\n    exo.run_until_motion()\n    exo.gateway.start()")
+    result = run(pytester)
+    result.assert_outcomes(failed=1)
+    result.stdout.fnmatch_lines(["E*FaultError: start: time 0 is known already*"])
 
 
 @pytest.mark.parametrize(
