@@ -209,15 +209,14 @@ def _served(serve: Callable[["ProcessOptions"], int], options: argparse.Namespac
     """Serve, and say what went wrong in one line."""
     from canopen_exo.errors import CanopenExoError
     from fi_gateway.errors import FaultError
-    from testbench.process import ProcessOptions, remove_orphaned
+    from testbench.process import ProcessOptions
 
     try:
-        return serve(ProcessOptions(options.epoch, options.part, options.fifo, options.supervisor))
+        how = ProcessOptions(options.epoch, options.part, options.fifo, options.supervisor, options.folder)
+        return serve(how)
     except (BenchError, CanopenExoError, FaultError) as error:
         print(error, file=sys.stderr)
         return USAGE
-    finally:
-        remove_orphaned(options.folder, options.supervisor)
 
 
 def _read_faults(options: argparse.Namespace) -> "FaultFile | None":

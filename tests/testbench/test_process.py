@@ -3,6 +3,7 @@
 Real processes against the clock are in test_supervisor.py and test_realtime.py.
 """
 
+import os
 import signal
 import socket
 import subprocess
@@ -195,6 +196,23 @@ def test_signal_handlers_of_the_caller_are_put_back() -> None:
         signal.raise_signal(signal.SIGINT)
         assert (orders.terminations, orders.interrupts, orders.count) == (1, 1, 2)
     assert signal.getsignal(signal.SIGTERM) is before
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="has no such signal")
+@pytest.mark.parametrize(("number", "stays"), [(signal.SIGTERM, True), (signal.SIGHUP, False)])
+def test_folder_of_the_rig_goes_when_the_supervisor_is_gone_and_not_when_it_tells_to_end(
+    channels: list[DeadChannel], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals, stays: bool
+) -> None:
+    """The kernel tells with SIGHUP, a supervisor with SIGTERM; it still needs the parts that are in there."""
+    monkeypatch.setattr(process, "die_with", lambda supervisor: None)
+    folder = tmp_path / "rig"
+    folder.mkdir()
+    (folder / "scenario.yaml").touch()
+    options = ProcessOptions(supervisor=os.getppid(), folder=folder)  # which is there, as far as anyone can see
+    with session("joints", Node(), ["hub:drive"], [0], options) as served:
+        signal.raise_signal(number)
+        served.run(lambda now: served.orders.count > 0)
+    assert folder.exists() == stays
 
 
 def test_process_whose_supervisor_is_gone_does_not_start(monkeypatch: pytest.MonkeyPatch) -> None:
