@@ -56,6 +56,10 @@ class Signal:
         """The payload with the raw value in it, saturated at the signal's range."""
         return write_bits(data, self.start, self.length, min(max(raw, self.low), self.high))
 
+    def __reduce__(self) -> tuple[type["Signal"], tuple[str | int | bool | float, ...]]:
+        given = (self.name, self.node, self.message, self.cob_id, self.start, self.length)
+        return Signal, (*given, self.signed, self.scale, self.unit, self.index, self.sub)
+
     def to_raw(self, value: float) -> int:
         """Nearest raw integer of an SI value, not saturated: `low`..`high` tells whether it fits."""
         return math.floor(value / self.scale + 0.5)
@@ -63,12 +67,6 @@ class Signal:
     def to_si(self, raw: int) -> float:
         """SI value of a raw integer."""
         return raw * self.scale
-
-    def __reduce__(self) -> tuple[type["Signal"], tuple[str | int | float | bool, ...]]:
-        """Copied through the constructor: a frozen class, once compiled, cannot be copied otherwise."""
-        what = (self.name, self.node, self.message, self.cob_id)
-        where = (self.start, self.length, self.signed)
-        return Signal, (*what, *where, self.scale, self.unit, self.index, self.sub)
 
 
 def read_bits(data: bytes, start: int, length: int, signed: bool) -> int:

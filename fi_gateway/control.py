@@ -229,13 +229,14 @@ def perform(control: LiveControl, word: str, name: str, now: int, source: str) -
 class Direction:
     """What went one way through a gateway, in frames.
 
-    lost: by a fault; undelivered: not offered, because the interface they were for was away; notices: error notices of
-    the interface they came in on; latency: from the stamp of a frame to its sending [ns], None when not measured.
+    lost, inserted: by a fault; undelivered: not offered, because the interface they were for was away; notices: error
+    notices of the interface they came in on; latency: from the stamp of a frame to its sending [ns], None when not measured.
     """
 
     direction: str
     frames: int
     lost: int
+    inserted: int
     undelivered: int
     notices: int
     latency: Lateness | None
@@ -248,6 +249,7 @@ def statistics(gateway: Gateway, latency: list[Lateness] | None) -> list[Directi
             name,
             gateway.frames[port],
             gateway.lost[port],
+            gateway.inserted[port],
             gateway.undelivered[port],
             gateway.notices[port],
             None if latency is None else latency[1 - port],
@@ -261,6 +263,8 @@ def statistics_text(directions: list[Direction]) -> str:
     lines = []
     for one in directions:
         parts = [f"{one.direction}: {one.frames} frames, {one.lost} lost by faults"]
+        if one.inserted:
+            parts.append(f"{one.inserted} added")
         if one.undelivered:
             parts.append(f"{one.undelivered} not delivered")
         if one.notices:

@@ -174,8 +174,11 @@ class Gateway(Node):
 
     def wake(self, now: int, out: Out) -> None:
         """Open and close the windows that are due, and send what faults have put off until now."""
-        self._passage.advance(now)
-        self._flush(now, out)
+        passage = self._passage
+        passage.advance(now)
+        self.wake_at = passage.next_ns
+        if passage.speaks:
+            self._flush(now, out)
 
     def port_changed(self, now: int, state: PortState, out: Out) -> None:
         """Count the notice, note what changed, and stop or resume sending there."""
@@ -189,8 +192,7 @@ class Gateway(Node):
         self._passage.advance(now - 1)
         for injector in self.injectors:
             injector.stop(now)
-        self._passage.plan()
-        self._arrange(now)
+        self.settle(now)
 
     def settle(self, now: int) -> None:
         """Do all that is due up to and including `now`, after injectors were armed or disarmed from outside."""
@@ -219,8 +221,8 @@ class Gateway(Node):
         for the COB-ID of live control, and for times from a power-up that is over.
         """
         name, commands = injector.name, self._commands
-        if commands is not None and commands.cob_id in injector.target.cob_ids:
-            raise FaultError(f"injector {name}: its target {commands.cob_id:#x} is the COB-ID of live control")
+        if commands is not None and injector.takes(commands.cob_id):
+            raise FaultError(f"injector {name}: its target or trigger {commands.cob_id:#x} is that of live control")
         if injector.from_power_up and not at_once and self._power_up != NEVER:
             raise FaultError(f"injector {name}: power-up is over; give it before the rig runs, or from: time_zero")
         self.settle(now - 1)
@@ -237,10 +239,10 @@ class Gateway(Node):
     def attach(self, commands: CommandPort) -> None:
         """Let `commands` read the frames of its COB-ID; no fault may have its hands on them. Raises FaultError."""
         for injector in self.injectors:
-            if commands.cob_id in injector.target.cob_ids:
+            if injector.takes(commands.cob_id):
                 raise FaultError(
-                    f"injector {injector.name}: its target {commands.cob_id:#x} is the COB-ID of live control; "
-                    "give another one for either"
+                    f"injector {injector.name}: its target or trigger {commands.cob_id:#x} is the COB-ID of live "
+                    "control; give another one for either"
                 )
         self._commands = commands
         self._passage.windows.keeps_opened = True
@@ -273,13 +275,12 @@ class Gateway(Node):
             self._observe(now, route.kind, frame)
         if now >= passage.next_ns:
             passage.advance(now)
-        if route.watchers or passage.windows.is_waiting:
+        if route.watchers or passage.is_waiting:
             passage.watch(now, port, route, frame)
         left = passage.through(now, port, route.injectors, frame)
-        if passage.outbox or passage.windows.opened:
+        self.wake_at = passage.next_ns
+        if passage.speaks:
             self._flush(now, out)
-        else:
-            self.wake_at = passage.next_ns
         return left
 
     def _observe(self, now: int, kind: int, frame: Frame) -> None:
@@ -303,11 +304,12 @@ class Gateway(Node):
     def _arrange(self, now: int) -> None:
         """Ask to be woken when there is something to do, or at once to say what could not be said without an `out`."""
         passage = self._passage
-        self.wake_at = now if passage.outbox or passage.windows.opened else passage.next_ns
+        self.wake_at = now if passage.speaks else passage.next_ns
 
     def _flush(self, now: int, out: Out) -> None:
         """Send what goes out besides the frame that has arrived, and say what has become active."""
         passage = self._passage
+        passage.speaks = False
         if passage.windows.opened:
             opened, passage.windows.opened = passage.windows.opened, []
             if self._commands is not None:
@@ -319,7 +321,6 @@ class Gateway(Node):
                     self.undelivered[1 - port] += 1
                 else:
                     out.send(port, frame)
-        self.wake_at = passage.next_ns
 
     def _change(self, now: int, port: int, state: ErrorState, cause: str) -> None:
         """A port has a new state."""

@@ -188,6 +188,12 @@ class Injector:
         """Where the last target frame came in; before one has, a side from which the target travels."""
         return self._port
 
+    def takes(self, cob_id: int) -> bool:
+        """Whether frames with that COB-ID are its target, or fire it."""
+        trigger = self.trigger
+        fires = trigger is not None and trigger.frame is not None and trigger.frame.cob_id == cob_id
+        return fires or cob_id in self.target.cob_ids
+
     def watches(self) -> list[tuple[int, int]]:
         """(port, COB-ID) of the frames that event and effect want to observe as they come in."""
         return sorted({*self._event.watches, *self._effect.watches})

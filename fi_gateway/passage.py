@@ -27,7 +27,7 @@ SYNC_READ: Final = 1
 STATUS_READ: Final = 2
 COMMAND: Final = 3
 
-_STATE: Final = ("windows", "lost", "inserted", "outbox", "next_ns", "_waiting", "_sequence")
+_STATE: Final = ("windows", "lost", "inserted", "outbox", "speaks", "next_ns", "is_waiting", "_waiting", "_sequence")
 """What `__reduce__` copies besides the constructor arguments; routes are laid afresh."""
 
 _Waiting = tuple[int, int, int, int, bool, Frame]
@@ -53,7 +53,8 @@ class Passage:
     """The way through a gateway, both ways. Ports are those a frame came in on; tables by port, then COB-ID.
 
     lost: frames that a fault lost, inserted: that one added, by port; outbox: (port to send on, frame) of what is to go
-    out at once, besides the frame that has arrived; next_ns: when there is something to do, NEVER for nothing.
+    out at once, besides the frame that has arrived; speaks: there is something in it, or a window has opened that live
+    control is to hear of; next_ns: when there is something to do, NEVER for nothing; is_waiting: for a frame.
     """
 
     def __init__(self, injectors: list[Injector]) -> None:
@@ -61,7 +62,9 @@ class Passage:
         self.lost: list[int] = [0, 0]
         self.inserted: list[int] = [0, 0]
         self.outbox: list[tuple[int, Frame]] = []
+        self.speaks: bool = False
         self.next_ns: int = NEVER
+        self.is_waiting: bool = False
         self.from_controller: Final[list[Route | None]] = [None] * 0x800
         self.from_drives: Final[list[Route | None]] = [None] * 0x800
         self._injectors: Final[list[Injector]] = []
@@ -98,6 +101,7 @@ class Passage:
         """Note when something is due next."""
         self.windows.plan()
         self.next_ns = self.windows.next_ns
+        self.is_waiting = self.windows.is_waiting
         if self._waiting and self._waiting[0][0] < self.next_ns:
             self.next_ns = self._waiting[0][0]
 
@@ -121,7 +125,7 @@ class Passage:
 
     def watch(self, now: int, port: int, route: Route, frame: Frame) -> None:
         """Let events, effects and triggers look at a frame as it comes in, and windows open that wait for one."""
-        happens = self.windows.is_waiting
+        happens = self.is_waiting
         for number in route.watchers:
             if self.windows.link(number).watch(now, port, frame):
                 happens = True
@@ -171,6 +175,7 @@ class Passage:
         left = self._go_on(now, port, number, frame)
         if left is not None:
             self.outbox.append((1 - port, left))
+            self.speaks = True
 
     def _carry_out(self, now: int, port: int, injector: Injector, is_gone: bool) -> bool:
         """What acting has left to be done. is_gone: a frame has arrived and does not go on at once; whether it will."""
@@ -247,9 +252,11 @@ class Passage:
 
     def _settle(self, now: int, arriving: list[Injector]) -> None:
         """Windows, and what is to be said about them on the bus."""
-        self.windows.settle(now, arriving)
-        if self.windows.said:
-            said, self.windows.said = self.windows.said, []
+        windows = self.windows
+        windows.settle(now, arriving)
+        if windows.opened or windows.said:
+            self.speaks = True
+            said, windows.said = windows.said, []
             for report in said:
                 self._say(report)
 

@@ -412,19 +412,23 @@ def _injection_lines(document: Summary) -> list[str]:
     lines = []
     for one in injections:
         end = "   to the end" if one["end_s"] is None else f"..{one['end_s']:8.3f} s "
-        what = _what(one)
+        hit = one["frames"] - one["frames_inserted"]
+        added = f", {one['frames_inserted']} inserted" if one["frames_inserted"] else ""
         cut = f", {one['saturated']} cut at the range" if one["saturated"] else ""
         lines.append(
             f"  {one['injector']:<{name}}  {one['signal'] or 'whole frame':<{signal}}  {one['start_s']:8.3f} {end}"
-            f"  {one['frames']:5d} of {one['frames_seen']} frames {what}{cut}  {one['cause']}"
+            f"  {hit:5d} of {one['frames_seen']} frames {_what(one)}{added}{cut}  {one['cause']}"
         )
-    return [f"injections: {counts['activated']} activated, {counts['manifested']} of {seen} frames hit", *lines]
+    inserted = sum(one["frames_inserted"] for one in injections)
+    more = f", {inserted} inserted" if inserted else ""
+    hit = counts["manifested"] - inserted
+    return [f"injections: {counts['activated']} activated, {hit} of {seen} frames hit{more}", *lines]
 
 
 def _what(one: InjectionEntry) -> str:
-    """What became of the frames, in one word."""
-    words = ("changed", "lost", "delayed", "inserted")
-    counts = (one["frames_changed"], one["frames_lost"], one["frames_delayed"], one["frames_inserted"])
+    """What became of the frames that came, in one word."""
+    words = ("changed", "lost", "delayed")
+    counts = (one["frames_changed"], one["frames_lost"], one["frames_delayed"])
     happened = [word for word, count in zip(words, counts, strict=True) if count]
     return "changed" if not happened else happened[0] if len(happened) == 1 else "hit"
 

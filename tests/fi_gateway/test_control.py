@@ -17,7 +17,7 @@ from canopen_exo.bus.node import MS, NEVER, SECOND, ErrorState, Out, PortState
 from canopen_exo.signal import Signal
 from fi_gateway import bus_control as wire
 from fi_gateway.bus_control import BusControl, Command, Status, read_command, read_status
-from fi_gateway.control import ControlRow, LiveControl, listing_text, perform, statistics, statistics_text
+from fi_gateway.control import ControlRow, Direction, LiveControl, listing_text, perform, statistics, statistics_text
 from fi_gateway.effects import ConstantTime, Effect, Infinite, Once
 from fi_gateway.errors import FaultError
 from fi_gateway.events import At, Event, Never
@@ -387,6 +387,12 @@ def test_statistics_are_by_direction() -> None:
     ]
 
 
+def test_statistics_count_what_faults_add() -> None:
+    """Inserted frames are none that came in."""
+    both = Direction("to_drives", 7, 1, 3, 0, 0, None)
+    assert statistics_text([both]) == "to_drives: 7 frames, 1 lost by faults, 3 added"
+
+
 # ---- frames on the bus --------------------------------------------------------------------------------------------
 
 
@@ -574,7 +580,7 @@ def test_ids_that_mean_something_else_are_refused(port: int, command_id: int, st
 def test_a_target_of_a_fault_cannot_be_the_command_id() -> None:
     """No fault has its hands on the commands."""
     control = live(injector())
-    with pytest.raises(FaultError, match="x: its target 0x185"):
+    with pytest.raises(FaultError, match="x: its target or trigger 0x185"):
         control.gateway.attach(BusControl(control, CONTROLLER_PORT, 0x185))
 
 

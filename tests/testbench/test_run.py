@@ -247,6 +247,7 @@ OUTCOMES = {
     "bit_flip": ("pass", "error"),  # one command far beyond the clamp, which no joint can follow within one cycle
     "knee_freeze_at": ("pass", "error"),  # loading response: the knee hardly moves, the sensor's return jumps
     "knee_freeze": ("fail", "failure"),  # swing: the knee is driven on, past the end of its range of travel
+    "fault_chain": ("pass", "masked"),  # 0.1 s frozen moves no joint past a limit; one heartbeat of three may be missed
 }
 
 
@@ -319,6 +320,28 @@ def test_flipped_bit_asks_for_more_torque_than_there_is_in_one_cycle(ran: Runner
         assert error["kind"] == "torque"
         assert 0 <= error["time_s"] - flip["start_s"] <= CYCLE_S
     assert document["failures"] == []
+
+
+def test_a_chain_of_triggers_starts_what_it_says_when_it_says() -> None:
+    """fault_chain: three freezes of four, some with a held command 20 ms after they show, then a lost heartbeat."""
+    result = run_scenario(load_scenario(SCENARIOS / "fault_chain.yaml"))
+    found: dict[str, list[tuple[float, float | None, str]]] = {}
+    for one in result.document["injections"]:
+        found.setdefault(one["injector"], []).append((one["start_s"], one["end_s"], one["cause"]))
+    freezes = found["freeze"]
+    assert [row[0] for row in freezes] == [2.0, 3.0, 4.0]
+    zero = result.faulted.time0_ns
+    shows = {row.index: row for row in result.faulted.activations if row.injector == "freeze"}
+    ends = sorted(row.end_ns for row in result.faulted.rows if row.bus == 1 and row.frame.can_id == 0x185)
+    first = {index: next(end for end in ends if end >= row.start_ns) for index, row in shows.items()}
+    delays = [(round(start * 1e9) + zero - 20_000_000) in first.values() for start, _, _ in found["held_torque"]]
+    assert 0 < len(delays) <= 3
+    assert all(delays)
+    (lost,) = found["lost_heartbeat"]
+    assert lost[2] == "trigger:freeze+held_torque"
+    assert lost[0] == freezes[0][1]
+    reports = [row for row in result.faulted.rows if row.frame.can_id == 0x6F1]
+    assert [(row.bus, row.frame.data) for row in reports] == [(1, b"\x01")] * 3
 
 
 def test_lost_samples_are_counted_and_hardly_felt(ran: Runner) -> None:

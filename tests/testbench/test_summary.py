@@ -136,6 +136,41 @@ def test_text_says_verdict_limits_and_expectations(failed: Summary) -> None:
     assert "not met: failures == 0 (found 1)" in text
 
 
+@pytest.mark.parametrize(
+    ("changed", "lost", "delayed", "inserted", "words", "total"),
+    [
+        (5, 0, 0, 0, "5 of 150 frames changed  event", "5 of 150 frames hit"),
+        (0, 6, 0, 0, "6 of 150 frames lost  event", "6 of 150 frames hit"),
+        (0, 0, 7, 0, "7 of 150 frames delayed  event", "7 of 150 frames hit"),
+        (1, 2, 3, 0, "6 of 150 frames hit  event", "6 of 150 frames hit"),
+        (0, 0, 0, 8, "0 of 150 frames changed, 8 inserted  event", "0 of 150 frames hit, 8 inserted"),
+        (1, 0, 0, 8, "1 of 150 frames changed, 8 inserted  event", "1 of 150 frames hit, 8 inserted"),
+    ],
+)
+def test_what_became_of_the_frames_is_counted_and_said(
+    run_maker: RunMaker,
+    activation_maker: ActivationMaker,
+    changed: int,
+    lost: int,
+    delayed: int,
+    inserted: int,
+    words: str,
+    total: str,
+) -> None:
+    """frames: all that were hit; each kind by itself; the terminal says it in a word."""
+    one = activation_maker()
+    one.frames_changed, one.frames_lost, one.frames_delayed, one.frames_inserted = changed, lost, delayed, inserted
+    found = document(run_maker(), run_maker(activations=[one]))
+    (entry,) = found["injections"]
+    assert entry["frames"] == found["counts"]["manifested"] == changed + lost + delayed + inserted
+    kinds = (entry["frames_changed"], entry["frames_lost"], entry["frames_delayed"], entry["frames_inserted"])
+    assert kinds == (changed, lost, delayed, inserted)
+    assert (entry["duration_s"], entry["frames_injected"]) == (0.3, 150)
+    text = summary_text(found)
+    assert words in text
+    assert f"1 activated, {total}\n" in text
+
+
 def test_columns_of_the_text_are_aligned(failed: Summary) -> None:
     """The separators of the joint table stand in one column."""
     table = [line for line in summary_text(failed).splitlines() if "|" in line]

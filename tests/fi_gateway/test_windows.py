@@ -1,0 +1,473 @@
+"""Windows and triggers over time: who starts whom, when, why; through receive() and wake() of a gateway."""
+
+import copy
+from collections.abc import Callable
+
+import pytest
+from scipy import stats
+
+from canopen_exo.bus.frame import FLAG_EXTENDED, Frame
+from canopen_exo.bus.loop import Loop
+from canopen_exo.bus.medium import Medium
+from canopen_exo.bus.node import MS, NEVER, Node, Out
+from canopen_exo.signal import Signal
+from fi_gateway.bus_control import BusControl
+from fi_gateway.control import LiveControl
+from fi_gateway.effects import ConstantTime, Effect, Infinite, Once
+from fi_gateway.errors import FaultError
+from fi_gateway.events import At, Event, Never
+from fi_gateway.faults import Bias, Drop, Fault, StuckAt, StuckAtValue
+from fi_gateway.gateway import CONTROLLER_PORT, DRIVE_PORT, Gateway
+from fi_gateway.injector import Injector, Target, stream
+from fi_gateway.trigger import BusFrame, Report, Trigger
+from fi_gateway.windows import graph_order
+
+COUNT = Signal("count", "left_hip", "left_hip_TPDO1", 0x181, 0, 8, False, 1.0, "", 0x2000, 0)
+HERE = Target(True, False, (0x181,))
+
+
+class Sink(Out):
+    """Keeps what is sent."""
+
+    def __init__(self) -> None:
+        self.sent: list[tuple[int, Frame]] = []
+
+    def send(self, port: int, frame: Frame) -> None:
+        self.sent.append((port, frame))
+
+
+def injector(
+    name: str = "x",
+    event: Event | None = None,
+    effect: Effect | None = None,
+    trigger: Trigger | None = None,
+    fault: Fault | None = None,
+    target: Target = HERE,
+    reports: tuple[Report, ...] = (),
+    seed: int = 1,
+    most: int = 0,
+) -> Injector:
+    """Counts from power-up; adds 1."""
+    return Injector(
+        name,
+        target,
+        fault if fault is not None else Bias(COUNT, 1),
+        event if event is not None else Never(),
+        effect if effect is not None else ConstantTime(50),
+        trigger,
+        stream(seed, 0, name),
+        True,
+        True,
+        None,
+        most,
+        None,
+        reports,
+    )
+
+
+def run(until: int, injectors: list[Injector], frames: tuple[tuple[int, Frame], ...] = ()) -> tuple[Gateway, Sink]:
+    """Power-up with a frame that is no target at 0, then these frames from the drives, all wake-ups up to `until`."""
+    gateway, sink = Gateway(injectors, 2 * MS), Sink()
+    for now, frame in ((0, Frame(0x7FF, b"")), *frames, (until + 1, None)):
+        while gateway.wake_at < now:
+            gateway.wake(gateway.wake_at, sink)
+        if frame is not None:
+            gateway.receive(now, DRIVE_PORT, frame, sink)
+    return gateway, sink
+
+
+def opened(gateway: Gateway) -> list[tuple[str, int, str]]:
+    return [(one.injector, one.start_ns, one.cause) for one in gateway.records]
+
+
+def tpdo(value: int = 5) -> Frame:
+    return Frame(0x181, bytes((value,)))
+
+
+# ---- the graph ----------------------------------------------------------------------------------------------------
+
+
+def names(injectors: list[Injector]) -> list[str]:
+    return [one.name for one in graph_order(injectors)]
+
+
+def test_sources_come_before_what_they_trigger_otherwise_as_written() -> None:
+    """faults.md: triggers settle in graph order; chains may branch and join."""
+    join = injector("join", trigger=Trigger((), "ended", ("left", "right"), delay_ns=3))
+    left = injector("left", trigger=Trigger(("root",)))
+    right = injector("right", trigger=Trigger(("root",)))
+    order = names([injector("z"), join, left, right, injector("root"), injector("a")])
+    assert order == ["z", "root", "left", "right", "join", "a"]
+
+
+def test_a_cycle_is_refused_with_the_cycle_printed() -> None:
+    """faults.md: a cycle is refused with the cycle printed, in the direction in which the triggers run."""
+    ring = [
+        injector("in", trigger=Trigger(("c",))),
+        injector("a", trigger=Trigger(("c",))),
+        injector("b", trigger=Trigger((), "manifested", ("a",), delay_ns=5)),
+        injector("c", trigger=Trigger(("b",))),
+    ]
+    with pytest.raises(FaultError, match="c -> a -> b -> c"):
+        graph_order(ring)
+
+
+def test_an_injector_that_triggers_itself_is_refused() -> None:
+    """The shortest cycle."""
+    with pytest.raises(FaultError, match="a -> a"):
+        graph_order([injector("a", trigger=Trigger(("a",)))])
+
+
+def test_unknown_and_double_names_are_refused() -> None:
+    """The message names what is there."""
+    with pytest.raises(FaultError, match="'ghost', allowed are a, b"):
+        graph_order([injector("a", trigger=Trigger(("ghost",))), injector("b")])
+    with pytest.raises(FaultError, match="given twice"):
+        graph_order([injector("a"), injector("a")])
+
+
+# ---- signals ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("on", "start"), [("activated", 100), ("manifested", 121), ("ended", 150)]
+)
+def test_a_trigger_listens_to_one_of_three_signals(on: str, start: int) -> None:
+    """on: activated | manifested | ended. A frame that is replaced by itself has not manifested."""
+    source = injector("a", At((100,)), fault=StuckAtValue(COUNT, 5))
+    gateway, _ = run(1000, [source, injector("b", trigger=Trigger(("a",), on))], ((110, tpdo(5)), (121, tpdo(6))))
+    assert opened(gateway) == [("a", 100, "event"), ("b", start, "trigger:a")]
+
+
+def test_a_delay_0_trigger_acts_on_the_same_frame() -> None:
+    """faults.md: first all triggers settle, then faults apply in written order."""
+    gateway, sink = run(
+        1000,
+        [injector("b", trigger=Trigger(("a",))), injector("a", At((100,))), injector("c", trigger=Trigger(("b",)))],
+        ((100, tpdo(5)),),
+    )
+    assert sink.sent[-1] == (0, tpdo(8))
+    assert {one.start_ns for one in gateway.records} == {100}
+
+
+def test_manifested_catches_the_same_frame_in_those_written_behind() -> None:
+    """The others, past which it has gone already, act from the next frame on."""
+    trigger = Trigger(("a",), "manifested")
+    order = [injector("before", trigger=trigger), injector("a", At((50,))), injector("behind", trigger=trigger)]
+    gateway, _ = run(1000, order, ((60, tpdo()), (70, tpdo())))
+    assert [(one.injector, one.start_ns, one.frames_seen) for one in gateway.records] == [
+        ("a", 50, 2),
+        ("before", 60, 1),
+        ("behind", 60, 2),
+    ]
+
+
+def test_once_has_ended_after_its_frame_not_on_it() -> None:
+    """The window [t0, t + 1): what starts at its end does not meet that frame, nor another one of the same instant."""
+    gateway, sink = run(
+        1000,
+        [injector("a", At((50,)), Once()), injector("b", trigger=Trigger(("a",), "ended"))],
+        ((60, tpdo()), (60, tpdo()), (61, tpdo())),
+    )
+    assert opened(gateway) == [("a", 50, "event"), ("b", 61, "trigger:a")]
+    assert [frame.data for _, frame in sink.sent[1:]] == [b"\x06", b"\x05", b"\x06"]
+
+
+@pytest.mark.parametrize(
+    ("on", "start"), [("activated", 130), ("manifested", 140), ("ended", 180)]
+)
+def test_all_waits_for_the_last_one(on: str, start: int) -> None:
+    """all: the instant at which the last of them shows the signal while the others do."""
+    sources = [injector("a", At((100,))), injector("b", At((130,)))]
+    join = injector("c", trigger=Trigger((), on, ("a", "b")))
+    gateway, _ = run(1000, [*sources, join], ((110, tpdo()), (140, tpdo())))
+    assert opened(gateway)[2:] == [("c", start, "trigger:a+b")]
+
+
+def test_all_does_not_count_what_is_over() -> None:
+    """activated holds while the window is open only: [100, 150) and [160, 210) have nothing in common."""
+    join = injector("c", trigger=Trigger((), "activated", ("a", "b")))
+    gateway, _ = run(1000, [injector("a", At((100,))), injector("b", At((160,))), join])
+    assert [one.injector for one in gateway.records] == ["a", "b"]
+
+
+def test_any_fires_with_each_of_them() -> None:
+    """any: whichever comes; while the window is open another one is ignored."""
+    sources = [injector("a", At((100, 400))), injector("b", At((120, 300)))]
+    gateway, _ = run(1000, [*sources, injector("c", trigger=Trigger(("a", "b")))])
+    assert [row for row in opened(gateway) if row[0] == "c"] == [
+        ("c", 100, "trigger:a"), ("c", 300, "trigger:b"), ("c", 400, "trigger:a")
+    ]  # fmt: skip
+
+
+def test_a_trigger_comes_in_addition_to_the_event() -> None:
+    """Whichever is first; the cause says which it was."""
+    gateway, _ = run(1000, [injector("a", At((100,))), injector("b", At((300,)), trigger=Trigger(("a",)))])
+    assert opened(gateway)[1:] == [("b", 100, "trigger:a"), ("b", 300, "event")]
+
+
+# ---- edge, delay, probability -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("level", "starts"), [(False, [100]), (True, [100, 120, 140])])
+def test_a_level_trigger_fires_again_while_it_holds(level: bool, starts: list[int]) -> None:
+    """edge: level, as the trigger input of a FIBlock: window [100, 150) of the source, windows of 20 of the other."""
+    trigger = Trigger(("a",), level=level)
+    gateway, _ = run(1000, [injector("a", At((100,))), injector("b", effect=ConstantTime(20), trigger=trigger)])
+    assert [one.start_ns for one in gateway.records if one.injector == "b"] == starts
+
+
+@pytest.mark.parametrize(
+    ("length", "delay", "starts"), [(50, 30, [130]), (50, 50, [150]), (50, 70, [170]), (29, 30, [130])]
+)
+def test_a_rising_trigger_fires_a_delay_later_whatever_has_ended(length: int, delay: int, starts: list[int]) -> None:
+    """delay: from the instant at which the signal rises."""
+    trigger = Trigger(("a",), delay_ns=delay)
+    gateway, _ = run(1000, [injector("a", At((100,)), ConstantTime(length)), injector("b", trigger=trigger)])
+    assert [one.start_ns for one in gateway.records if one.injector == "b"] == starts
+    assert [one.due_ns for one in gateway.records if one.injector == "b"] == starts
+
+
+@pytest.mark.parametrize(("length", "starts"), [(30, []), (31, [130]), (50, [130, 140])])
+def test_a_level_must_have_held_for_the_delay(length: int, starts: list[int]) -> None:
+    """[100, 100 + length): at 130 it has held for 30, unless it ends there."""
+    trigger = Trigger(("a",), level=True, delay_ns=30)
+    gateway, _ = run(
+        1000,
+        [injector("a", At((100,)), ConstantTime(length)), injector("b", effect=ConstantTime(10), trigger=trigger)],
+    )
+    assert [one.start_ns for one in gateway.records if one.injector == "b"] == starts
+
+
+def test_delayed_triggers_queue_and_those_that_find_it_open_are_ignored() -> None:
+    """Rises at 100, 160, 200 and delay 100: 200, 260, 300; windows of 50 from 200 and 260."""
+    trigger = Trigger(("a",), delay_ns=100)
+    gateway, _ = run(1000, [injector("a", At((100, 160, 200)), ConstantTime(5)), injector("b", trigger=trigger)])
+    assert [one.start_ns for one in gateway.records if one.injector == "b"] == [200, 260]
+
+
+@pytest.mark.parametrize(("probability", "right"), [(0.0, True), (0.3, True), (1.0, True), (0.3, False)])
+def test_a_trigger_fires_with_its_probability(probability: float, right: bool) -> None:
+    """Binomial, per rise, over seeds 0..19 at 1 %: at most 2 rejections; 0.3 is not 0.25, and the same test says so."""
+    rejected = 0
+    for seed in range(20):
+        source = injector("a", At(tuple(range(0, 2_000_000, 1000))), ConstantTime(5))
+        target = injector("b", trigger=Trigger(("a",), probability=probability), effect=ConstantTime(5), seed=seed)
+        run(2_000_000, [source, target])
+        expected = probability if right else 0.25
+        rejected += stats.binomtest(target.activated, source.activated, expected).pvalue < 0.01
+    assert (rejected <= 2) == right
+
+
+def test_a_trigger_draws_from_the_stream_of_its_own_injector() -> None:
+    """Another injector more or less changes no draw."""
+
+    def starts(*more: Injector) -> list[int]:
+        source = injector("a", At(tuple(range(0, 100_000, 1000))), ConstantTime(5))
+        target = injector("b", trigger=Trigger(("a",), probability=0.5), effect=ConstantTime(5))
+        gateway, _ = run(100_000, [*more, source, target])
+        return [one.start_ns for one in gateway.records if one.injector == "b"]
+
+    alone = starts()
+    assert 0 < len(alone) < 100
+    assert starts(injector("c", trigger=Trigger(("a",), probability=0.5), effect=ConstantTime(5))) == alone
+
+
+def test_max_activations_ends_it() -> None:
+    """Then it is spent; the records say how often."""
+    one = injector("a", At((100, 200, 300)), most=2)
+    gateway, _ = run(1000, [one])
+    assert [record.start_ns for record in gateway.records] == [100, 200]
+    assert one.phase.value == "spent"
+
+
+def test_a_trigger_waits_for_a_value_like_an_event() -> None:
+    """stuck_at without a value yet: opens with the frame after the first; the cause stays."""
+    waits = injector("b", trigger=Trigger(("a",)), fault=StuckAt(COUNT))
+    gateway, _ = run(1000, [injector("a", At((100,))), waits], ((110, tpdo()), (120, tpdo())))
+    record = gateway.records[1]
+    assert (record.injector, record.due_ns, record.start_ns, record.cause) == ("b", 100, 120, "trigger:a")
+
+
+def test_live_control_sets_off_a_chain_with_delays() -> None:
+    """trigger: with everything that hangs on it, and when."""
+    gateway = Gateway([injector("a"), injector("b", trigger=Trigger(("a",), "ended", delay_ns=20))], 2 * MS)
+    sink = Sink()
+    gateway.receive(0, DRIVE_PORT, Frame(0x7FF, b""), sink)
+    control = LiveControl(gateway)
+    control.trigger("a", 100)
+    while gateway.wake_at < NEVER:
+        gateway.wake(gateway.wake_at, sink)
+    assert opened(gateway) == [("a", 100, "command"), ("b", 170, "trigger:a")]
+
+
+def test_arming_finds_a_level_that_holds_already() -> None:
+    """edge: level: whenever it is armed and the condition holds."""
+    late = injector("b", trigger=Trigger(("a",), level=True), effect=ConstantTime(20))
+    gateway, sink = Gateway([injector("a", At((100,)), Infinite()), late], 2 * MS), Sink()
+    gateway.receive(0, DRIVE_PORT, Frame(0x7FF, b""), sink)
+    control = LiveControl(gateway)
+    control.disarm("b", 50)
+    gateway.wake(gateway.wake_at, sink)
+    assert [one.injector for one in gateway.records] == ["a"]
+    control.arm("b", 150)
+    assert opened(gateway)[1:] == [("b", 150, "trigger:a")]
+
+
+def test_a_copy_keeps_what_triggers_have_heard() -> None:
+    """Snapshots: delays that run, levels that hold, rises that were seen."""
+    injectors = [
+        injector("a", At((100, 400))),
+        injector("b", trigger=Trigger(("a",), delay_ns=70, probability=0.5)),
+        injector("c", effect=ConstantTime(7), trigger=Trigger(("a",), level=True)),
+        injector("d", trigger=Trigger((), "ended", ("a", "b"))),
+    ]
+    gateway, sink = Gateway(injectors, 2 * MS), Sink()
+    gateway.receive(0, DRIVE_PORT, Frame(0x7FF, b""), sink)
+    while gateway.wake_at < 1000:
+        twin = copy.deepcopy(gateway)
+        while twin.wake_at < 1000:
+            twin.wake(twin.wake_at, sink)
+        if gateway.wake_at < 1000:
+            gateway.wake(gateway.wake_at, sink)
+        later = copy.deepcopy(gateway)
+        while later.wake_at < 1000:
+            later.wake(later.wake_at, sink)
+        assert opened(twin) == opened(later)
+
+
+# ---- over the bus -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("frame", "port", "fires"),
+    [
+        (Frame(0x6F0, b"\x01\x10"), CONTROLLER_PORT, True),
+        (Frame(0x6F0, b"\x01\x1f"), CONTROLLER_PORT, True),
+        (Frame(0x6F0, b"\x01\x2f"), CONTROLLER_PORT, False),
+        (Frame(0x6F0, b"\x02\x10"), CONTROLLER_PORT, False),
+        (Frame(0x6F0, b"\x01"), CONTROLLER_PORT, False),
+        (Frame(0x6F0, b"\x01\x10\x00"), CONTROLLER_PORT, False),
+        (Frame(0x6F1, b"\x01\x10"), CONTROLLER_PORT, False),
+        (Frame(0x6F0, b"\x01\x10"), DRIVE_PORT, False),
+        (Frame(0x6F0, b"\x01\x10", FLAG_EXTENDED), CONTROLLER_PORT, False),
+    ],
+)
+def test_a_frame_of_that_id_and_payload_is_a_trigger(frame: Frame, port: int, fires: bool) -> None:
+    """A given id and payload, under a mask, on one side; the frame itself passes."""
+    pattern = BusFrame(0x6F0, b"\x01\x10", b"\xff\xf0", False, True)
+    gateway, sink = Gateway([injector("a", trigger=Trigger(frame=pattern))], 2 * MS), Sink()
+    gateway.receive(0, DRIVE_PORT, Frame(0x7FF, b""), sink)
+    gateway.receive(50, port, frame, sink)
+    assert sink.sent[-1] == (1 - port, frame)
+    assert opened(gateway) == ([("a", 50, "frame:0x6F0")] if fires else [])
+
+
+def test_a_frame_can_be_trigger_and_target() -> None:
+    """Triggers settle before faults apply: it is met by what it starts."""
+    pattern = BusFrame(0x181, b"\x05", b"\xff", True, True)
+    _, sink = run(1000, [injector("a", trigger=Trigger(frame=pattern))], ((50, tpdo(4)), (60, tpdo(5)), (70, tpdo(4))))
+    assert [frame.data for _, frame in sink.sent[1:]] == [b"\x04", b"\x06", b"\x05"]
+
+
+@pytest.mark.parametrize(
+    ("on", "times"), [("activated", [100, 200]), ("manifested", [120, 200]), ("ended", [150, 250])]
+)
+def test_a_report_goes_out_each_time_the_signal_rises(on: str, times: list[int]) -> None:
+    """report: a frame with that id and payload, on the sides asked for."""
+    frame = Frame(0x6F1, b"\x01")
+    one = injector("a", At((100, 200)), reports=(Report(frame, on, True, True), Report(frame, on, False, True)))
+    gateway, sink = Gateway([one], 2 * MS), Sink()
+    said: list[int] = []
+    for now, given in ((0, Frame(0x7FF, b"")), (120, tpdo()), (200, tpdo()), (1000, tpdo())):
+        while gateway.wake_at < now:
+            at = gateway.wake_at
+            gateway.wake(at, sink)
+            said += [at] * [row for row in sink.sent if row[1] is frame].count((0, frame))
+            sink.sent.clear()
+        gateway.receive(now, DRIVE_PORT, given, sink)
+        rows = [row for row in sink.sent if row[1] is frame]
+        assert rows.count((1, frame)) == 2 * rows.count((0, frame))
+        said += [now] * rows.count((0, frame))
+        sink.sent.clear()
+    assert said == times
+
+
+def test_live_control_keeps_its_cob_id_for_itself() -> None:
+    """A trigger frame with the COB-ID of commands would never be seen."""
+    gateway = Gateway([injector("a", trigger=Trigger(frame=BusFrame(0x6C0, b"", b"", True, True)))], 2 * MS)
+    with pytest.raises(FaultError, match=r"injector a: .*0x6c0 is the COB-ID of live control"):
+        gateway.attach(BusControl(LiveControl(gateway), CONTROLLER_PORT))
+
+
+class Talker(Node):
+    """Sends a frame every `period` ns."""
+
+    def __init__(self, period: int, frame: Frame) -> None:
+        super().__init__()
+        self.period = period
+        self.frame = frame
+        self.wake_at = period
+
+    def wake(self, now: int, out: Out) -> None:
+        self.wake_at = now + self.period
+        out.send(0, self.frame)
+
+
+def test_two_gateways_chain_over_the_bus() -> None:
+    """One reports, the other is fired by it: three buses, two gateways, a talker, in one lock-step loop.
+
+    The report is queued at 1 ms on the middle bus and the gateway beyond is fired at its end: its length in bits later.
+    """
+    report = Frame(0x6F0, b"\x2a")
+    first = Gateway(
+        [injector("first", At((1_000_000,)), ConstantTime(500_000), reports=(Report(report, "activated", True, False),),
+                  target=Target(True, False, (0x182,)), fault=Drop())],
+        2 * MS,
+    )  # fmt: skip
+    pattern = BusFrame(0x6F0, b"\x2a", b"\xff", True, False)
+    trigger = Trigger(frame=pattern)
+    second = Gateway([injector("second", effect=ConstantTime(MS), trigger=trigger, fault=Drop())], 2 * MS)
+    media = [Medium(name, index, 1_000_000) for index, name in enumerate(("controller", "middle", "drive"))]
+    loop = Loop(media)
+    loop.connect(second, [media[0], media[1]])
+    loop.connect(first, [media[1], media[2]])
+    loop.connect(Talker(100_000, tpdo()), [media[2]])
+    loop.run_until(4 * MS)
+    hop = tpdo().measure() * 1000
+    power_up = 100_000 + hop
+    start = power_up + 1_000_000
+    sent = [row for row in loop.trace if row.frame == report]
+    assert [row.bus for row in sent] == [1, 0]
+    (record,) = second.records
+    assert (record.cause, record.start_ns) == ("frame:0x6F0", sent[0].end_ns)
+    assert first.records[0].start_ns == start <= sent[0].end_ns - report.measure() * 1000 < start + 2 * hop
+    came = [row.end_ns for row in loop.trace if row.bus == 0 and row.frame.can_id == 0x181]
+    assert came
+    assert not any(record.start_ns + hop < end <= record.end_ns for end in came)
+    assert second.lost == [0, 10] == [0, record.frames_lost]
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: Trigger(),
+        lambda: Trigger(("a",), "started"),
+        lambda: Trigger(("a",), all_of=("b",)),
+        lambda: Trigger(("a",), frame=BusFrame(1, b"", b"", True, True)),
+        lambda: Trigger(("a",), delay_ns=-1),
+        lambda: Trigger(("a",), probability=1.01),
+        lambda: Trigger(frame=BusFrame(1, b"", b"", True, True), level=True),
+        lambda: BusFrame(0x800, b"", b"", True, True),
+        lambda: BusFrame(1, b"\x01", b"", True, True),
+        lambda: BusFrame(1, bytes(9), bytes(9), True, True),
+        lambda: BusFrame(1, b"", b"", False, False),
+        lambda: Report(tpdo(), "started", True, True),
+        lambda: Report(tpdo(), "ended", False, False),
+        lambda: injector(most=-1),
+    ],
+)
+def test_what_cannot_be_is_refused_where_it_is_made(make: Callable[[], object]) -> None:
+    """The message lists what is allowed."""
+    with pytest.raises(FaultError, match="allowed"):
+        make()
