@@ -11,6 +11,10 @@ READY := $(VENV)/.set-up-complete
 STARTED := $(VENV)/.set-up-started
 RECENT := import sys; sys.exit(sys.version_info < (3, 11))
 
+# A part of the tests says which ones it skipped and why, and leaves a report for the last lines of `make test`.
+PYTEST := $(BIN)/python -m pytest -rs
+REPORTS := build/reports
+
 # What a user's shell has set must not reach into the virtual environment.
 unexport PYTHONPATH PYTHONHOME PYTHONSTARTUP PYTHONOPTIMIZE PIP_USER PIP_TARGET PIP_PREFIX PIP_REQUIRE_VIRTUALENV
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
@@ -24,7 +28,7 @@ endif
 
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test lint unit realtime vcan compile bench soak lock clean moved
+.PHONY: help setup demo test lint unit runs realtime vcan compile bench soak lock clean moved
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-8s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -53,21 +57,25 @@ demo: $(READY) ## a frozen knee encoder, with its verdict (pass and fail are bot
 	$(BIN)/python -c 'import json; print("verdict:", json.load(open("results/demo/summary.json"))["verdict"])' && \
 	echo "traces and plots: results/demo"
 
-test: lint unit compile ## everything CI holds: lint, tests, compiled build equals interpreted build
+test: lint unit runs realtime vcan compile ## all of the next six; says last how many tests were skipped, and why
+	@$(BIN)/python -m tests.summary $(foreach part,unit runs realtime vcan,$(REPORTS)/$(part).xml)
 
 lint: $(READY) ## ruff, mypy --strict, import contracts
 	$(BIN)/python -m ruff check .
 	$(BIN)/python -m mypy
 	$(BIN)/lint-imports --no-logo
 
-unit: $(READY) ## pytest alone, on WORKERS=2 processes, without what runs against the clock
-	$(BIN)/python -m pytest -n $(WORKERS) -m "not realtime" --ignore=tests/vcan
+unit: $(READY) ## the tests that need no whole run and no clock, on WORKERS=2 processes: half a minute
+	$(PYTEST) -n $(WORKERS) -m "not run and not realtime" --ignore=tests/vcan --junitxml=$(REPORTS)/$@.xml
 
-realtime: $(READY) ## tests against the clock, one at a time; says how many were skipped on a machine too busy for them
-	$(BIN)/python -m pytest -m realtime --ignore=tests/vcan -rs
+runs: $(READY) ## whole scenario runs in virtual time, and the examples, on WORKERS=2 processes
+	$(PYTEST) -n $(WORKERS) -m run --ignore=tests/vcan --junitxml=$(REPORTS)/$@.xml
+
+realtime: $(READY) ## rigs of processes against the clock, one at a time, on the hub; a machine too busy for them skips
+	$(PYTEST) -m realtime --ignore=tests/vcan --junitxml=$(REPORTS)/$@.xml
 
 vcan: $(READY) ## tests on a real SocketCAN: vcan where the kernel has it, else User Mode Linux (a Debian package, fetched)
-	$(BIN)/python -m pytest tests/vcan -rs
+	$(PYTEST) tests/vcan --junitxml=$(REPORTS)/$@.xml
 
 compile: $(READY) ## the core compiled with mypyc must give the same traces (skipped, saying why, without a C compiler)
 	$(BIN)/python benchmarks/compile_core.py
@@ -89,4 +97,4 @@ lock: ## for maintainers: newest versions allowed by pyproject.toml into require
 
 clean: ## remove build products and caches; keeps .venv and results
 	rm -rf build dist .cache .mypy_cache .ruff_cache .import_linter_cache .pytest_cache .hypothesis
-	find canopen_exo joint_emulators hlc fi_gateway testbench dbc tests benchmarks -name __pycache__ -prune -exec rm -rf {} +
+	find canopen_exo joint_emulators hlc fi_gateway testbench dbc tests benchmarks examples -name __pycache__ -prune -exec rm -rf {} +

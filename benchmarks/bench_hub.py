@@ -4,8 +4,8 @@ Each figure: a server, a sender and a receiver, three processes on loopback; 8-b
 them; the receiver says when a frame is missing or out of order. Both servers are measured in turns, so that both see
 the same machine; the median of the turns counts. Two figures each:
 
-- forwarding: what the server can carry. The sender writes bytes that its own client library has made beforehand, the
-  receiver reads bytes and looks at them afterwards, so that neither client sets the pace.
+- forwarding: the throughput of the server, at saturation with clients that are not what is waited for. The sender
+  writes bytes that its own client library has made beforehand, the receiver reads bytes and looks at them afterwards.
 - through python-can: what two programs get that make, send, receive and read one `can.Message` after the other. Making
   and reading messages costs the same with both, which the ratio contains.
 

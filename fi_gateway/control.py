@@ -230,7 +230,8 @@ class Direction:
     """What went one way through a gateway, in frames.
 
     lost, inserted: by a fault; undelivered: not offered, because the interface they were for was away; notices: error
-    notices of the interface they came in on; latency: from the stamp of a frame to its sending [ns], None when not measured.
+    notices of the interface they came in on; latency: from the stamp of a frame to its sending [ns], None when not
+    measured.
     """
 
     direction: str
@@ -275,6 +276,24 @@ def statistics_text(directions: list[Direction]) -> str:
             parts.append(f"added latency: median {median:.0f} us, 99 % {most:.0f} us, worst {worst:.0f} us")
         lines.append(", ".join(parts))
     return "\n".join(lines)
+
+
+def latency_text(directions: list[Direction]) -> str:
+    """Histogram of the added latency, one line for each direction that has one: octaves of ns, told by upper edge."""
+    lines = []
+    for one in directions:
+        octaves: dict[int, int] = {}
+        for lower, number in one.latency.document()["bins"] if one.latency is not None else ():
+            octaves[lower.bit_length()] = octaves.get(lower.bit_length(), 0) + number
+        if octaves:
+            parts = [f"<= {_edge_text(2**bits)}: {number}" for bits, number in sorted(octaves.items())]
+            lines.append(f"{one.direction}: frames by added latency: {', '.join(parts)}")
+    return "\n".join(lines)
+
+
+def _edge_text(edge_ns: int) -> str:
+    """An edge of the histogram, in two or three digits."""
+    return f"{edge_ns / 1e3:.2g} us" if edge_ns < 100_000 else f"{edge_ns / 1e6:.2g} ms"
 
 
 def listing_text(rows: list[InjectorRow], now: int) -> str:

@@ -28,7 +28,7 @@ from typing import Final, final
 from mypy_extensions import mypyc_attr
 
 from canopen_exo.bus.frame import Frame
-from canopen_exo.bus.node import MS, NEVER, ErrorState, Node, Out, PortState
+from canopen_exo.bus.node import MS, NEVER, ErrorState, Out, PortState, Relay
 from canopen_exo.plan import STATUS_MOTION, STATUS_STOPPED
 from fi_gateway.activation import Activation
 from fi_gateway.errors import FaultError
@@ -51,7 +51,7 @@ _STATE: Final = (
     "_states",
     "_away",
     "_probe_at",
-    "_is_disturbed",
+    "is_disturbed",
 )
 """What `__reduce__` copies besides the constructor arguments; the routes are laid afresh, and what is attached stays
 with the original."""
@@ -97,7 +97,7 @@ class CommandPort:
 
 
 @final
-class Gateway(Node):
+class Gateway(Relay):
     """Two ports: CONTROLLER_PORT and DRIVE_PORT. What comes in on one goes out on the other.
 
     injectors: in the order in which their faults apply; cycle_ns: SYNC period, ns; passage: for a copy, that of the
@@ -114,7 +114,6 @@ class Gateway(Node):
         if cycle_ns <= 0:
             raise FaultError(f"gateway: SYNC period {cycle_ns} ns given, allowed 1 ns and more")
         self.injectors: Final[list[Injector]] = list(injectors)
-        self.frames: list[int] = [0, 0]
         self.undelivered: list[int] = [0, 0]
         self.notices: list[int] = [0, 0]
         self.port_changes: list[PortChange] = []
@@ -127,13 +126,13 @@ class Gateway(Node):
         self._states: list[ErrorState] = [ErrorState.ERROR_ACTIVE, ErrorState.ERROR_ACTIVE]
         self._away: list[bool] = [False, False]
         self._probe_at: list[int] = [0, 0]
-        self._is_disturbed: bool = False
         self._passage: Final[Passage] = passage if passage is not None else Passage(self.injectors)
         self._from_controller: Final[list[Route | None]] = self._passage.from_controller
         self._from_drives: Final[list[Route | None]] = self._passage.from_drives
         for injector in injectors:
             if injector.from_power_up:
                 self._power_up = NEVER
+        self._note_passes()
 
     @property
     def records(self) -> list[Activation]:
@@ -165,7 +164,7 @@ class Gateway(Node):
                 if left is None:
                     return
                 frame = left
-        if self._is_disturbed:
+        if self.is_disturbed:
             self._came_in(now, port)
             if not self._can_send(now, 1 - port):
                 self.undelivered[port] += 1
@@ -227,6 +226,7 @@ class Gateway(Node):
             raise FaultError(f"injector {name}: power-up is over; give it before the rig runs, or from: time_zero")
         self.settle(now - 1)
         self._passage.add(injector)
+        self._note_passes()
         self.injectors.append(injector)
         base_ns = now if at_once else self.time_zero
         if base_ns != NEVER:
@@ -248,15 +248,23 @@ class Gateway(Node):
         self._passage.windows.keeps_opened = True
         table = self._from_drives if commands.port == DRIVE_PORT else self._from_controller
         table[commands.cob_id] = Route(COMMAND)
+        self._note_passes()
 
     def __reduce__(self) -> tuple[type["Gateway"], tuple[list[Injector], int, Passage], dict[str, object]]:
         state = {name: getattr(self, name) for name in _STATE}
         return Gateway, (self.injectors, self._cycle_ns, self._passage), state
 
+    def _note_passes(self) -> None:
+        """Say which frames need nothing from here."""
+        for port, table in ((CONTROLLER_PORT, self._from_controller), (DRIVE_PORT, self._from_drives)):
+            for cob_id, route in enumerate(table):
+                self.passes[port][cob_id] = 1 if route is None else 0
+
     def _power_on(self, now: int) -> None:
         """The first frame: start the injectors that count from here."""
         self._power_up = now
         self._passage.free()
+        self._note_passes()
         for injector in self.injectors:
             if injector.from_power_up:
                 injector.start(now)
@@ -317,7 +325,7 @@ class Gateway(Node):
         if passage.outbox:
             outbox, passage.outbox = passage.outbox, []
             for port, frame in outbox:
-                if self._is_disturbed and not self._can_send(now, port):
+                if self.is_disturbed and not self._can_send(now, port):
                     self.undelivered[1 - port] += 1
                 else:
                     out.send(port, frame)
@@ -329,7 +337,7 @@ class Gateway(Node):
             self.port_changes.append(PortChange(now, port, state, cause))
         self._away[port] = state is ErrorState.BUS_OFF or state is ErrorState.DOWN
         self._probe_at[port] = now + _PROBE_NS
-        self._is_disturbed = self._away[0] or self._away[1]
+        self.is_disturbed = self._away[0] or self._away[1]
 
     def _came_in(self, now: int, port: int) -> None:
         """A frame has come in: the port is there."""

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
-from testbench.cli_rig import add_rig_options, add_verbs, named_buses
+from testbench.cli_rig import CONTROL_ADDRESS, HUB_ADDRESS, add_rig_options, add_verbs, named_buses
 
 PASS: Final = 0
 FAIL: Final = 1
@@ -76,7 +76,7 @@ def _parser() -> argparse.ArgumentParser:
     run.set_defaults(verb=_run)
 
     check = verbs.add_parser("check", help="validate a scenario and say what it will do", description=_check.__doc__)
-    check.add_argument("scenario", type=Path, metavar="FILE", help="a scenario file")
+    check.add_argument("scenario", type=Path, metavar="FILE", help="a scenario, or faults for `exo-hil gateway`")
     check.add_argument("--seed", metavar="N", help="instead of the scenario's seed")
     check.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="overrides", help="as for run")
     check.set_defaults(verb=_check)
@@ -122,6 +122,10 @@ def _run(options: argparse.Namespace) -> int:
     try:
         scenario = load_scenario(options.scenario, overrides)
         buses = _real_time_buses(options)
+        if options.realtime:
+            from testbench.realtime_run import check_expectations
+
+            check_expectations(scenario, frozenset(options.without))
         folder = options.out or default_folder(scenario.name, scenario.seed, options.overrides)
         check_folder(folder)
     except (FileErrors, BenchError) as error:
@@ -140,8 +144,10 @@ def _run(options: argparse.Namespace) -> int:
             if options.realtime:
                 from testbench.realtime_run import run_realtime
 
+                without = frozenset(options.without)
+                places = _places(options, without)
                 result = run_realtime(
-                    scenario, buses, frozenset(options.without), fifo=options.fifo, progress=progress
+                    scenario, buses, without, fifo=options.fifo, places=places, progress=progress, announce=_say
                 )
             else:
                 from testbench.run import run_scenario
@@ -167,31 +173,39 @@ def _run(options: argparse.Namespace) -> int:
     return PASS if result.judgement.passed else FAIL
 
 
+def _places(options: argparse.Namespace, without: frozenset[str]) -> tuple[str, str]:
+    """Where hub and live control listen: where foreign software looks for them, else on a free port and in a folder."""
+    listen = options.listen or (HUB_ADDRESS if without else "127.0.0.1:0")
+    return listen, options.control or (CONTROL_ADDRESS if "hlc" in without else "")
+
+
 def _real_time_buses(options: argparse.Namespace) -> tuple[str, str] | None:
     """The buses named; raises BenchError when something of real time is given without --realtime."""
     from testbench.errors import BenchError
 
     buses = named_buses(options)
-    if not options.realtime and (buses or options.without or options.fifo):
-        raise BenchError("--controller-bus, --drive-bus, --without and --fifo are of real time; add --realtime")
+    if not options.realtime and (buses or options.without or options.fifo or options.listen or options.control):
+        real_time = "--controller-bus, --drive-bus, --without, --listen, --control and --fifo"
+        raise BenchError(f"{real_time} are of real time; add --realtime")
     return buses
 
 
 def _check(options: argparse.Namespace) -> int:
-    """Validate a scenario file and say in words what it will do; nothing is run."""
+    """Validate a scenario, or a file of faults for the gateway, and say in words what it will do; nothing is run."""
     from fi_gateway.marked_yaml import FileErrors
-    from testbench.scenario import describe, load_scenario
+    from testbench.fault_file import FaultFile, describe_faults, load_any
+    from testbench.scenario import describe
 
     overrides = list(options.overrides)
     if options.seed is not None:
         overrides.append(f"seed={options.seed}")
     try:
-        scenario = load_scenario(options.scenario, overrides)
+        found = load_any(options.scenario, overrides)
     except FileErrors as error:
         _say(_as_typed(error, options))
         return USAGE
-    _print("\n".join(describe(scenario)) + "\n")
-    for warning in scenario.warnings:
+    _print("\n".join(describe_faults(found) if isinstance(found, FaultFile) else describe(found)) + "\n")
+    for warning in found.warnings:
         _say(f"warning: {warning}")
     return PASS
 

@@ -5,12 +5,14 @@ Nothing heavy is imported before a verb needs it.
 
 import argparse
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Protocol
 
 from testbench.errors import BenchError
 
 if TYPE_CHECKING:
+    from testbench.fault_file import FaultFile
     from testbench.process import ProcessOptions
     from testbench.scenario import Scenario
 
@@ -20,6 +22,7 @@ INVALID: Final = 3
 
 PARTS: Final = ("joints", "gateway", "hlc")
 
+HUB_ADDRESS: Final = "127.0.0.1:29536"
 CONTROL_ADDRESS: Final = "127.0.0.1:29537"
 NAMED: Final = ("arm", "disarm", "trigger")
 UNNAMED: Final = ("start", "stop", "resume")
@@ -48,27 +51,31 @@ def add_verbs(verbs: Verbs) -> None:
     up = verbs.add_parser("up", help="the whole rig as real-time processes until Ctrl-C", description=_up.__doc__)
     _add_scenario(up)
     add_rig_options(up)
-    up.add_argument(
-        "--listen", metavar="HOST:PORT", default="127.0.0.1:29536", help="of the own hub (default: %(default)s)"
-    )
-    up.add_argument(
-        "--control", metavar="ADDRESS", default=CONTROL_ADDRESS, help="of the gateway (default: %(default)s)"
-    )
     up.add_argument("--no-faults", action="store_true", help="without the scenario's injectors")
     up.set_defaults(verb=_up)
 
     joints = verbs.add_parser("joints", help="six drives on their plant, one process", description=_joints.__doc__)
+    _add_scenario(joints)
     _add_process(joints)
     joints.add_argument("--bus", metavar="BUS", help=f"drive bus: {_BUS_HELP} (default: hub:drive)")
     joints.set_defaults(verb=_joints)
 
     hlc = verbs.add_parser("hlc", help="the high-level controller, one process", description=_hlc.__doc__)
+    _add_scenario(hlc)
     _add_process(hlc)
     hlc.add_argument("--bus", metavar="BUS", help=f"controller bus: {_BUS_HELP} (default: hub:controller)")
     hlc.add_argument("--endless", action="store_true", help="walk until told to end, not for the scenario's duration")
     hlc.set_defaults(verb=_hlc)
 
     gateway = verbs.add_parser("gateway", help="the fault-injecting gateway, one process", description=_gateway.__doc__)
+    gateway.add_argument(
+        "scenario",
+        type=Path,
+        nargs="?",
+        metavar="FAULTS.yaml",
+        help="injectors, or a whole scenario (default: none, every frame passes)",
+    )
+    _add_overrides(gateway)
     _add_process(gateway)
     gateway.add_argument("--controller-bus", metavar="BUS", help=f"{_BUS_HELP} (default: hub:controller)")
     gateway.add_argument("--drive-bus", metavar="BUS", help=f"{_BUS_HELP} (default: hub:drive)")
@@ -91,11 +98,11 @@ def add_verbs(verbs: Verbs) -> None:
 
     hub = verbs.add_parser("hub", help="an emulated bus for machines without CAN", description=_hub.__doc__)
     hub.add_argument(
-        "--listen", metavar="HOST:PORT", default="127.0.0.1:29536", help="port 0: a free one (default: %(default)s)"
+        "--listen", metavar="HOST:PORT", default=HUB_ADDRESS, help="port 0: a free one (default: %(default)s)"
     )
     hub.add_argument("--timed", action="store_true", help="with bit time and arbitration of a real bus")
     hub.add_argument("--bitrate", type=int, default=1_000_000, metavar="N", help="with --timed (default: %(default)s)")
-    hub.add_argument("--supervisor", type=int, default=0, help=argparse.SUPPRESS)
+    _add_supervisor(hub)
     hub.set_defaults(verb=_hub)
 
 
@@ -111,6 +118,9 @@ def add_rig_options(parser: argparse.ArgumentParser) -> None:
         metavar="PART",
         help="leave joints, gateway or hlc to foreign software on the same buses; may be repeated",
     )
+    known = "where others must find it; else any free one"
+    parser.add_argument("--listen", metavar="HOST:PORT", help=f"of the own hub (default: {HUB_ADDRESS} {known})")
+    parser.add_argument("--control", metavar="ADDRESS", help=f"of the gateway (default: {CONTROL_ADDRESS} {known})")
     parser.add_argument("--fifo", action="store_true", help="real-time scheduling (SCHED_FIFO), where permitted")
 
 
@@ -135,29 +145,45 @@ def _add_scenario(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "scenario", type=Path, nargs="?", metavar="SCENARIO.yaml", help="rig and faults (default: 500 Hz, no faults)"
     )
+    _add_overrides(parser)
+
+
+def _add_overrides(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="overrides", help="as for run")
 
 
 def _add_process(parser: argparse.ArgumentParser) -> None:
-    _add_scenario(parser)
     parser.add_argument("--epoch", type=int, default=0, metavar="NS", help="CLOCK_MONOTONIC at time 0 of the rig")
     parser.add_argument("--part", type=Path, metavar="FILE", help="leave this process's part of the result there")
     parser.add_argument("--fifo", action="store_true", help="real-time scheduling (SCHED_FIFO), where permitted")
+    _add_supervisor(parser)
+
+
+def _add_supervisor(parser: argparse.ArgumentParser) -> None:
+    """For processes of a supervised rig: who that is, and the rig's folder, which goes when he is gone."""
     parser.add_argument("--supervisor", type=int, default=0, help=argparse.SUPPRESS)
+    parser.add_argument("--folder", type=Path, default=None, help=argparse.SUPPRESS)
 
 
 def _joints(options: argparse.Namespace) -> int:
     """Six drives on their plant on the drive bus, until SIGTERM or Ctrl-C."""
     from testbench.process import joints_main
 
-    return _served(lambda scenario, how: joints_main(scenario, _bus(options.bus, "drive"), how), options)
+    def serve(how: "ProcessOptions") -> int:
+        scenario = read_scenario(options)
+        return USAGE if scenario is None else joints_main(scenario, _bus(options.bus, "drive"), how)
+
+    return _served(serve, options)
 
 
 def _hlc(options: argparse.Namespace) -> int:
     """The high-level controller on the controller bus: boots the drives, walks, disables them; exit 1 if it gave up."""
     from testbench.process import hlc_main
 
-    def serve(scenario: "Scenario", how: "ProcessOptions") -> int:
+    def serve(how: "ProcessOptions") -> int:
+        scenario = read_scenario(options)
+        if scenario is None:
+            return USAGE
         return hlc_main(scenario, _bus(options.bus, "controller"), how, options.endless)
 
     return _served(serve, options)
@@ -167,34 +193,51 @@ def _gateway(options: argparse.Namespace) -> int:
     """The gateway between two buses. The first Ctrl-C ends all faults, frames pass on; the second one ends it."""
     from testbench.gateway_process import GatewayOptions, control_frames, gateway_main
 
-    def serve(scenario: "Scenario", how: "ProcessOptions") -> int:
+    def serve(how: "ProcessOptions") -> int:
+        faults = _read_faults(options)
+        if faults is None:
+            return USAGE
         buses = (_bus(options.controller_bus, "controller"), _bus(options.drive_bus, "drive"))
         _check_two(*buses)
         frames = None if options.control_frames is None else control_frames(options.control_frames)
-        return gateway_main(scenario, buses, how, GatewayOptions(not options.no_faults, options.control, frames))
+        return gateway_main(faults, buses, how, GatewayOptions(not options.no_faults, options.control, frames))
 
     return _served(serve, options)
 
 
-class _Serve(Protocol):
-    def __call__(self, scenario: "Scenario", how: "ProcessOptions") -> int:
-        """Run one process; returns the exit code."""
-
-
-def _served(serve: _Serve, options: argparse.Namespace) -> int:
-    """Read the scenario, serve, and say what went wrong in one line."""
+def _served(serve: Callable[["ProcessOptions"], int], options: argparse.Namespace) -> int:
+    """Serve, and say what went wrong in one line."""
     from canopen_exo.errors import CanopenExoError
+    from fi_gateway.errors import FaultError
     from testbench.process import ProcessOptions
 
     try:
-        scenario = read_scenario(options)
-        if scenario is None:
-            return USAGE
-        how = ProcessOptions(options.epoch, options.part, options.fifo, options.supervisor)
-        return serve(scenario, how)
-    except (BenchError, CanopenExoError) as error:
+        how = ProcessOptions(options.epoch, options.part, options.fifo, options.supervisor, options.folder)
+        return serve(how)
+    except (BenchError, CanopenExoError, FaultError) as error:
         print(error, file=sys.stderr)
         return USAGE
+
+
+def _read_faults(options: argparse.Namespace) -> "FaultFile | None":
+    """The faults in the file named, or none of them; None when the file is wrong, which is said."""
+    from fi_gateway.marked_yaml import FileErrors
+    from testbench.fault_file import faults_of, load_faults, no_faults
+
+    try:
+        if options.scenario is not None:
+            faults = load_faults(options.scenario, options.overrides)
+        elif options.overrides:
+            scenario = read_scenario(options)
+            return None if scenario is None else faults_of(scenario)
+        else:
+            faults = no_faults()
+    except FileErrors as error:
+        print(error, file=sys.stderr)
+        return None
+    for warning in [] if options.no_faults else faults.warnings:
+        print(f"warning: {warning}", file=sys.stderr)
+    return faults
 
 
 def read_scenario(options: argparse.Namespace) -> "Scenario | None":
@@ -224,15 +267,17 @@ def _bus(given: str | None, role: str) -> str:
 def _hub(options: argparse.Namespace) -> int:
     """A CAN bus over TCP: everything that connects to the same name is on the same bus. Prints where it listens."""
     from canopen_exo.bus.hub import hub_main
-    from testbench.process import die_with
+    from testbench.process import die_with, remove_orphaned
 
     try:
         if options.supervisor:
             die_with(options.supervisor)
+        return hub_main(options.listen, options.timed, options.bitrate)
     except BenchError as error:
         print(f"hub: {error}", file=sys.stderr)
         return USAGE
-    return hub_main(options.listen, options.timed, options.bitrate)
+    finally:
+        remove_orphaned(options.folder, options.supervisor)
 
 
 def _fault(options: argparse.Namespace) -> int:
@@ -243,6 +288,13 @@ def _fault(options: argparse.Namespace) -> int:
     from fi_gateway.errors import FaultError
     from testbench.gateway_process import fault_main
 
+    word, name = options.word, options.name
+    if word in NAMED and not name:
+        print(f"fault {word}: which injector? `exo-hil fault list` names them", file=sys.stderr)
+        return USAGE
+    if name and word not in NAMED:
+        print(f"fault {word}: {name!r} given, allowed is nothing: it is about the whole gateway", file=sys.stderr)
+        return USAGE
     try:
         return fault_main(options.word, options.name, options.at)
     except FaultError as error:
@@ -253,8 +305,9 @@ def _fault(options: argparse.Namespace) -> int:
 def _up(options: argparse.Namespace) -> int:
     """Start hub, joints, gateway and controller, walk until Ctrl-C, and stop them in order."""
     from canopen_exo.errors import CanopenExoError
+    from testbench.child import ProcessError
     from testbench.live import run_up
-    from testbench.supervisor import ProcessError, Setup
+    from testbench.supervisor import Setup
 
     scenario = read_scenario(options)
     if scenario is None:
@@ -267,8 +320,8 @@ def _up(options: argparse.Namespace) -> int:
             faults=not options.no_faults,
             endless=True,
             fifo=options.fifo,
-            listen=options.listen,
-            control=options.control,
+            listen=options.listen or HUB_ADDRESS,
+            control=options.control or CONTROL_ADDRESS,
         )
         return run_up(setup)
     except ProcessError as error:

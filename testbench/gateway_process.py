@@ -1,6 +1,7 @@
 """The gateway as a process: two interfaces, live control over a socket and, where asked for, over the bus.
 
 The first SIGINT stops injecting and frames pass on until `exo-hil fault resume`; the second one, or SIGTERM, ends it.
+It says what it stands between when it is ready, and what went through it, by direction, at its end.
 Needs neither MuJoCo nor the controller.
 """
 
@@ -11,7 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from fi_gateway.bus_control import DEFAULT_COMMAND_ID, DEFAULT_STATUS_ID, BusControl
-from fi_gateway.control import LiveControl, statistics, statistics_text
+from fi_gateway.control import LiveControl, latency_text, statistics, statistics_text
 from fi_gateway.control_socket import ControlServer
 from fi_gateway.errors import FaultError
 from fi_gateway.gateway import CONTROLLER_PORT, DRIVE_PORT, Gateway
@@ -19,7 +20,7 @@ from testbench.errors import BenchError
 from testbench.process import DONE, ProcessOptions, Session, say, session
 
 if TYPE_CHECKING:
-    from testbench.scenario import Scenario
+    from testbench.fault_file import FaultFile
 
 SIDES: Final = {"controller": CONTROLLER_PORT, "drive": DRIVE_PORT}
 
@@ -35,7 +36,7 @@ class ControlFrames:
 
 @dataclass(frozen=True, slots=True)
 class GatewayOptions:
-    """faults: with the scenario's injectors; control: address of the control socket, "" for none."""
+    """faults: with the file's injectors; control: address of the control socket, "" for none."""
 
     faults: bool = True
     control: str = ""
@@ -43,13 +44,13 @@ class GatewayOptions:
 
 
 def gateway_main(
-    scenario: "Scenario", buses: tuple[str, str], options: ProcessOptions, given: GatewayOptions
+    faults: "FaultFile", buses: tuple[str, str], options: ProcessOptions, given: GatewayOptions
 ) -> int:
-    """The gateway between two buses, until told to end."""
+    """The gateway between two buses, until told to end. Raises BenchError, FaultError."""
     from fi_gateway.addition import Additions
 
-    additions = Additions(scenario.injectors if given.faults else {}, scenario.plan, scenario.seed)
-    gateway = Gateway(additions.built(), scenario.plan.cycle_ns)
+    additions = Additions(faults.injectors if given.faults else {}, faults.plan, faults.seed)
+    gateway = Gateway(additions.built(), faults.plan.cycle_ns)
     control = LiveControl(gateway, additions)
     if given.frames is not None:
         gateway.attach(BusControl(control, given.frames.port, given.frames.command_id, given.frames.status_id))
@@ -62,12 +63,20 @@ def gateway_main(
                 say("gateway", f"live control at {server.address}")
                 if server.is_exposed:
                     say("gateway", f"warning: {server.address} can be reached from other machines")
-            _serve(process, control)
+            say("gateway", f"between {buses[0]} (controller) and {buses[1]} (drives); {_injectors_text(gateway)}")
+            _serve(process, control, server is not None or given.frames is not None)
         gateway.finish(process.loop.now())
         if options.part is not None:
             _leave_part(options, process, control)
-        say("gateway", statistics_text(statistics(gateway, process.loop.latency)).replace("\n", "; "))
+        directions = statistics(gateway, process.loop.latency)
+        for line in f"{statistics_text(directions)}\n{latency_text(directions)}".splitlines():
+            say("gateway", line)
     return DONE
+
+
+def _injectors_text(gateway: Gateway) -> str:
+    names = [one.name for one in gateway.injectors]
+    return f"injectors: {', '.join(names)}" if names else "no injectors, every frame passes"
 
 
 def control_frames(text: str) -> ControlFrames:
@@ -110,8 +119,10 @@ def active_faults(address: str) -> list[str]:
     return [row.name for row in listing.injectors if row.state == Phase.ACTIVE.value]
 
 
-def _serve(process: Session, control: LiveControl) -> None:
+def _serve(process: Session, control: LiveControl, can_resume: bool) -> None:
+    """Until told to end. can_resume: there is live control to resume injection with."""
     interrupted = False
+    how = "`exo-hil fault resume` resumes" if can_resume else "nothing resumes it without --control"
 
     def is_over(now: int) -> bool:
         nonlocal interrupted
@@ -119,7 +130,7 @@ def _serve(process: Session, control: LiveControl) -> None:
         if orders.interrupts and not interrupted:
             interrupted = True
             control.pass_through(now, "signal")
-            say("gateway", "injection is stopped, frames pass on; `exo-hil fault resume` resumes, Ctrl-C ends")
+            say("gateway", f"injection is stopped, frames pass on; {how}, Ctrl-C ends")
         return orders.terminations > 0 or orders.interrupts > 1
 
     process.run(is_over)

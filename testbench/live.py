@@ -24,15 +24,15 @@ def run_up(setup: Setup) -> int:
             line.show(now)
 
     try:
-        with Supervisor(setup, say, show) as rig:
+        with Supervisor(setup, say, show, announce=say) as rig:
             rig.start()
             for what, bus in zip(("controller bus", "drive bus"), rig.buses, strict=True):
                 say(f"{what}: {bus}")
-            if "hlc" in setup.without:
-                say(f"ready for a controller on {rig.buses[0]}")
-            say(f"live control: exo-hil fault list --at {rig.control_address}")
+            address = rig.control_address
+            if address:
+                say(f"live control: exo-hil fault list --at {address}")
             say("running; Ctrl-C stops")
-            line = StatusLine(rig.watch, sys.stderr, lambda: active_faults(rig.control_address))
+            line = StatusLine(rig.watch, sys.stderr, lambda: active_faults(address) if address else [])
             rig.run(lambda now: False)
     except KeyboardInterrupt:
         if line is not None:

@@ -4,7 +4,8 @@ Truth is the plant's (part of the joints), commands and events are the controlle
 activations and time 0 on the bus are the gateway's. Where one was foreign software, frames stand in for it, taken where
 they come to the gateway, before any fault; without gateway, as the supervisor heard them:
 joints: position and velocity of TPDO1 at the instant of their SYNC, straight lines between; torque of TPDO2, held.
-controller: torques of RPDO1 as sent, so after whatever limit the controller has; its reference is not known.
+controller: torques of RPDO1 as sent, so after whatever limit the controller has; its reference is not known. It gave
+the motion up when it falls silent, or a drive that was enabled at time 0 says in TPDO2 that it no longer is.
 """
 
 from collections.abc import Callable
@@ -16,6 +17,7 @@ from canopen_exo import plan as ids
 from canopen_exo.bus.frame import FLAG_FD
 from canopen_exo.bus.medium import Transmission
 from canopen_exo.bus.node import MS, NEVER
+from canopen_exo.cia402 import DriveState, decode_statusword
 from canopen_exo.plan import BusPlan, Pdo
 from canopen_exo.signal import Codec
 from testbench.errors import BenchError
@@ -26,6 +28,12 @@ from testbench.timing import CONTROLLER_BUS, DRIVE_BUS
 BUS_NAMES: Final = ("controller", "drive")
 
 _MOST_REASONS: Final = 6
+
+GIVEN_UP: Final = "given_up"
+"""Kind of the event that ended the motion of a foreign controller."""
+
+SILENT_CYCLES: Final = 10
+"""A controller that sends no RPDO1 for longer has given up: the deadline that our own sets in the drives."""
 
 PLANT: Final = "plant"
 BUS: Final = "bus"
@@ -53,6 +61,7 @@ def merge(
     rows = sorted(rows, key=lambda row: row.end_ns)  # sent and received frames of a bus as they were on it
     end = zero + duration_ns
     activations = [] if gateway is None else gateway.activations
+    given_up = None if hlc is not None else _given_up(plan, rows, zero, end)
     truth = _truth_of(joints, zero, end) if joints is not None else _truth_from_frames(plan, rows, zero, end)
     return RunRecord(
         rows=rows,
@@ -62,8 +71,8 @@ def merge(
         commands=_commands_of(plan, hlc) if hlc is not None else _commands_from_frames(plan, rows, zero, end),
         activations=[one for one in activations if one.start_ns < on_bus + duration_ns],
         buses=tuple(_stats(plan, rows, index, zero, end) for index in (CONTROLLER_BUS, DRIVE_BUS)),
-        notes=_notes(plan, zero, hlc, gateway, rows),
-        completed=hlc is None or hlc.completed,
+        notes=_notes(plan, zero, hlc, gateway, rows, given_up),
+        completed=given_up is None if hlc is None else hlc.completed,
         held_cycles=[0] * len(plan.joints) if hlc is None else list(hlc.held),
         source=PLANT if joints is not None else BUS,
     )
@@ -92,7 +101,9 @@ def add_reasons(record: RunRecord, reasons: list[str], golden: bool) -> None:
     """Enter why the run proves nothing."""
     record.invalid_reasons.extend(reasons)
     if golden and not record.completed:
-        record.invalid_reasons.append("the motion was given up without a fault")
+        ends = [note for note in record.notes if note.kind == GIVEN_UP]
+        why = f": {ends[0].node} at {ends[0].time_s:.3f} s: {ends[0].text}" if ends else ""
+        record.invalid_reasons.append(f"the motion was given up without a fault{why}")
 
 
 def _zero_on_bus(plan: BusPlan, rows: list[Transmission]) -> int:
@@ -162,6 +173,39 @@ def _commands_from_frames(plan: BusPlan, rows: list[Transmission], zero: int, en
     return Commands((grid - zero) / 1e9, nothing, nothing, tau)
 
 
+def _given_up(plan: BusPlan, rows: list[Transmission], zero: int, end: int) -> RigEvent | None:
+    """What first ended the motion of a foreign controller, by its frames and those of the drives; None: nothing did."""
+    pdo = plan.pdo("TPDO2")
+    codec, statusword = pdo.codec(), pdo.place("statusword")
+    drives = {ids.TPDO2 + joint.node_id: joint.name for joint in plan.joints}
+    commands = {ids.RPDO1 + joint.node_id for joint in plan.joints}
+    silence_ns = SILENT_CYCLES * plan.cycle_ns
+    enabled: set[int] = set()
+    commanded = NEVER
+    for row in rows:
+        frame, now = row.frame, row.end_ns
+        if now > end:
+            break
+        if commanded < NEVER and now > zero and now - commanded > silence_ns:
+            return _silence(commanded - zero)
+        if row.bus == CONTROLLER_BUS and frame.can_id in commands and frame.flags == 0:
+            commanded = now
+        elif row.bus == DRIVE_BUS and row.sender < 0 and frame.can_id in drives and len(frame.data) >= codec.size:
+            state = decode_statusword(codec.unpack(frame.data)[statusword])
+            if state is DriveState.OPERATION_ENABLED:
+                enabled.add(frame.can_id)
+            elif frame.can_id in enabled and now > zero and state is not None:
+                text = f"left Operation enabled, now {state.name.replace('_', ' ').lower()}"
+                return RigEvent((now - zero) / 1e9, drives[frame.can_id], GIVEN_UP, text)
+            else:
+                enabled.discard(frame.can_id)
+    return _silence(commanded - zero) if commanded < NEVER and end - commanded > silence_ns else None
+
+
+def _silence(since_ns: int) -> RigEvent:
+    return RigEvent(since_ns / 1e9, "HLC", GIVEN_UP, f"no command for more than {SILENT_CYCLES} cycles after this one")
+
+
 def _process_data(rows: list[Transmission], bus: int, cob_id: int, pdo: Pdo) -> tuple[Array, Array]:
     """(n,) ns: when the SYNC before each frame came; (n, values) raw. Frames received on that bus."""
     codec: Codec = pdo.codec()
@@ -198,9 +242,14 @@ def _stats(plan: BusPlan, rows: list[Transmission], index: int, zero: int, end: 
 
 
 def _notes(
-    plan: BusPlan, zero: int, hlc: HlcPart | None, gateway: GatewayPart | None, rows: list[Transmission]
+    plan: BusPlan,
+    zero: int,
+    hlc: HlcPart | None,
+    gateway: GatewayPart | None,
+    rows: list[Transmission],
+    given_up: RigEvent | None,
 ) -> list[RigEvent]:
-    """Events from time 0, in order; without our controller the EMCYs of the drives."""
+    """Events from time 0, in order; without our controller the EMCYs of the drives, and what ended the motion."""
     notes: list[RigEvent] = []
     after: Callable[[int], float] = lambda time_ns: (time_ns - zero) / 1e9  # noqa: E731
     if hlc is not None:
@@ -213,6 +262,8 @@ def _notes(
                 code = int.from_bytes(frame.data[:2], "little")
                 text = f"error {code:04X}" if code else "errors gone"
                 notes.append(RigEvent(after(row.end_ns), names[frame.can_id], "emcy", text))
+    if given_up is not None:
+        notes.append(given_up)
     if gateway is not None:
         for control in gateway.controls:
             refused = f": {control.refused}" if control.refused else ""

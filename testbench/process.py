@@ -2,13 +2,14 @@
 
 Each serves one Node on its interfaces until it is told to end, and then leaves its part of the result. All processes
 of a rig share one epoch on CLOCK_MONOTONIC, so that the grids of SYNC and of physics agree as in lock-step.
-SIGTERM and SIGINT end a process in order. A supervised process ends by itself when its supervisor is gone.
+SIGTERM, SIGINT and SIGHUP end a process in order. A supervised process ends by itself when its supervisor is gone.
 The gateway (testbench.gateway_process) needs neither MuJoCo nor the controller: everything heavy is imported by the
 process that needs it.
 """
 
 import ctypes
 import os
+import shutil
 import signal
 import sys
 import time
@@ -44,18 +45,23 @@ _LOOK_NS: Final = 50 * MS
 
 _PR_SET_PDEATHSIG: Final = 1  # prctl(2)
 
+_HANG_UP: Final = signal.SIGTERM if sys.platform == "win32" else signal.SIGHUP
+"""The terminal, or on Linux the supervisor, is gone. Not SIGTERM, which a supervisor sends that goes on."""
+
 
 @dataclass(frozen=True, slots=True)
 class ProcessOptions:
     """How a process runs. epoch_ns: time 0 of the rig on CLOCK_MONOTONIC, 0 for now; part: where to leave its part.
 
-    fifo: ask for real-time scheduling; supervisor: its process id, 0 for none.
+    fifo: ask for real-time scheduling; supervisor: its process id, 0 for none; folder: of the rig, to be removed when
+    the supervisor is gone.
     """
 
     epoch_ns: int = 0
     part: Path | None = None
     fifo: bool = False
     supervisor: int = 0
+    folder: Path | None = None
 
 
 @final
@@ -65,6 +71,7 @@ class Orders:
     def __init__(self) -> None:
         self.interrupts: int = 0
         self.terminations: int = 0
+        self.is_hung_up: bool = False
 
     @property
     def count(self) -> int:
@@ -77,11 +84,13 @@ class Orders:
             self.interrupts += 1
         else:
             self.terminations += 1
+            self.is_hung_up = self.is_hung_up or number == _HANG_UP
 
     @contextmanager
     def taken(self) -> Iterator["Orders"]:
-        """SIGINT and SIGTERM are noted here; the handlers before are put back at the end."""
-        before = [(number, signal.signal(number, self.note)) for number in (signal.SIGINT, signal.SIGTERM)]
+        """SIGINT, SIGTERM and SIGHUP are noted here; the handlers before are put back at the end."""
+        numbers = {signal.SIGINT, signal.SIGTERM, _HANG_UP}
+        before = [(number, signal.signal(number, self.note)) for number in sorted(numbers)]
         try:
             yield self
         finally:
@@ -145,22 +154,23 @@ def session(
     name: str, node: Node, buses: list[str], ports: list[int], options: ProcessOptions
 ) -> Iterator[Session]:
     """A node with its interfaces open. Raises BenchError when one cannot be opened; says what it could not get."""
-    if options.supervisor:
-        die_with(options.supervisor)
-    if options.fifo:
-        refusal = request_fifo()
-        if refusal is not None:
-            say(name, refusal)
     orders = Orders()
     channels: list[Channel] = []
-    with orders.taken():
-        try:
+    try:
+        with orders.taken():
+            if options.supervisor:
+                die_with(options.supervisor)
+            if options.fifo:
+                refusal = request_fifo()
+                if refusal is not None:
+                    say(name, refusal)
             for bus in buses:
                 channels.append(open_bus(bus))
             yield Session(name, node, channels, ports, options, orders)
-        finally:
-            for channel in channels:
-                channel.close()
+    finally:
+        for channel in channels:
+            channel.close()
+        remove_orphaned(options.folder, options.supervisor, orders.is_hung_up)
 
 
 def joints_main(scenario: "Scenario", bus: str, options: ProcessOptions) -> int:
@@ -172,6 +182,7 @@ def joints_main(scenario: "Scenario", bus: str, options: ProcessOptions) -> int:
     rack = build_rack(params, build_mechanics(params))
     with session("joints", rack, [bus], [0] * len(rack.devices), options) as process:
         rack.step_at = rack.wake_at = process.start_ns
+        say("joints", f"{len(rack.devices)} drives on {bus}")
 
         def over(now: int) -> bool:
             if options.part is None:
@@ -195,6 +206,7 @@ def hlc_main(scenario: "Scenario", bus: str, options: ProcessOptions, endless: b
     duration_ns = 0 if endless else params.duration_ns
     with session("hlc", master, [bus], [0], options) as process:
         master.wake_at = master.supervise_at = process.start_ns
+        say("hlc", f"controller on {bus}")
         give_up_at = NEVER
 
         def over(now: int) -> bool:
@@ -266,11 +278,21 @@ def open_bus(bus: str) -> Channel:
 
 
 def die_with(supervisor: int) -> None:
-    """Have SIGTERM sent to this process when its supervisor ends (Linux); elsewhere it only looks for it regularly."""
+    """Have SIGHUP sent to this process when its supervisor ends (Linux); elsewhere it only looks for it regularly."""
     if sys.platform == "linux":
-        ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
+        ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, _HANG_UP, 0, 0, 0)
     if os.getppid() != supervisor:
         raise BenchError(f"the supervisor (process {supervisor}) is gone; start this process by itself or with `up`")
+
+
+def remove_orphaned(folder: Path | None, supervisor: int, is_hung_up: bool = False) -> None:
+    """Remove the folder of a rig whose supervisor was killed; the last of its processes to end leaves nothing.
+
+    is_hung_up: the kernel has told, which it does when the supervisor's main thread is gone: its others may linger, and
+    keep its process id in getppid().
+    """
+    if folder is not None and supervisor and (is_hung_up or os.getppid() != supervisor):
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def say(name: str, text: str) -> None:

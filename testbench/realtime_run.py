@@ -16,14 +16,15 @@ from canopen_exo.bus.node import NEVER, SECOND
 from fi_gateway.control_socket import ask_listing
 from fi_gateway.errors import FaultError
 from hlc.limits import limits_of
+from testbench.child import Process, ProcessError
 from testbench.errors import BenchError
-from testbench.merge import add_reasons, merge, time_zero_of
+from testbench.merge import IncompleteError, add_reasons, merge, time_zero_of
 from testbench.parts import PartError, read_gateway, read_hlc, read_joints
 from testbench.record import RunRecord
 from testbench.run import CHUNK_NS, LEAVE_NS, START_NS, Progress, Result
 from testbench.scenario import Scenario
 from testbench.summary import RealTimeEntry, RealTimeRunEntry, summary_document
-from testbench.supervisor import ProcessError, Setup, Supervisor
+from testbench.supervisor import Setup, Supervisor
 from testbench.timing import Timing, TimingLimits, judge_timing
 from testbench.verdict import judge
 
@@ -52,18 +53,28 @@ def run_realtime(
     without: frozenset[str] = frozenset(),
     *,
     fifo: bool = False,
+    places: tuple[str, str] = ("127.0.0.1:0", ""),
     progress: Progress = lambda share: None,
-    say: Callable[[str], None] = lambda line: None,
+    announce: Callable[[str], None] = lambda text: None,
 ) -> Result:
     """Golden run, faulted run, verdict. buses: controller and drive bus, None for an own hub; without: foreign parts.
 
+    places: where own hub and live control listen, see Setup; announce: told what foreign software is waited for.
     Raises BenchError when a run gives nothing to judge: a process died, a part is missing, the motion never began.
     """
-    _check_expectations(scenario, without)
+    check_expectations(scenario, without)
     started = time.perf_counter()
-    setup = Setup(scenario, buses, without, faults=False, keep_parts=True, fifo=fifo)
-    golden = run_once(setup, lambda share: progress(0.5 * share), say)
-    faulted = run_once(replace(setup, faults=True), lambda share: progress(0.5 + 0.5 * share), say)
+    listen, control = places
+    setup = Setup(
+        scenario, buses, without, faults=False, keep_parts=True, fifo=fifo, listen=listen, control=control
+    )
+    if without and buses is None:  # one hub for both runs, so that foreign software stays on its buses
+        with Supervisor(setup) as host:
+            host.start_hub()
+            setup = replace(setup, buses=host.buses)
+            golden, faulted = _run_pair(setup, progress, announce, host.processes["hub"])
+    else:
+        golden, faulted = _run_pair(setup, progress, announce, None)
     names = tuple(joint.name for joint in scenario.plan.joints)
     judgement = judge(
         names,
@@ -87,13 +98,33 @@ def run_realtime(
     return Result(scenario, golden.record, faulted.record, judgement, document)
 
 
+def _run_pair(
+    setup: Setup, progress: Progress, announce: Callable[[str], None], hub: Process | None
+) -> tuple[RealTimeRun, RealTimeRun]:
+    """Golden and faulted run."""
+    if "gateway" in setup.without and setup.scenario.injectors:
+        announce(f"injectors {', '.join(setup.scenario.injectors)}: not used, the gateway is left out")
+    golden = run_once(setup, lambda share: progress(0.5 * share), announce=announce, hub=hub)
+    faulted = run_once(
+        replace(setup, faults=True), lambda share: progress(0.5 + 0.5 * share), announce=announce, hub=hub
+    )
+    return golden, faulted
+
+
 def run_once(
-    setup: Setup, progress: Progress = lambda share: None, say: Callable[[str], None] = lambda line: None
+    setup: Setup,
+    progress: Progress = lambda share: None,
+    *,
+    announce: Callable[[str], None] = lambda text: None,
+    hub: Process | None = None,
 ) -> RealTimeRun:
-    """One run from power-up to disabled drives, its parts merged and its timing judged. Raises BenchError."""
+    """One run from power-up to disabled drives, its parts merged and its timing judged. Raises BenchError.
+
+    announce: told what foreign software is waited for; hub: that the buses are on, where it serves more than this run.
+    """
     which = "faulted run" if setup.faults else "golden run"
     try:
-        with Supervisor(setup, say) as rig:
+        with Supervisor(setup, announce=lambda text: announce(f"{which}: {text}"), hub=hub) as rig:
             rig.start()
             _drive_through(rig, setup, progress)
             rig.stop()
@@ -159,7 +190,12 @@ def _gather(rig: Supervisor, setup: Setup) -> RealTimeRun:
 
     hlc, gateway, joints = read("hlc", read_hlc), read("gateway", read_gateway), read("joints", read_joints)
     plan, duration_ns = setup.scenario.plan, setup.scenario.motion.duration_ns
-    record = merge(plan, duration_ns, hlc, gateway, joints, rig.rows)
+    try:
+        record = merge(plan, duration_ns, hlc, gateway, joints, rig.rows)
+    except IncompleteError as error:
+        parts = {"hlc": hlc, "gateway": gateway, "joints": joints}
+        served = [f"{name} {part.service.lateness.words()}" for name, part in parts.items() if part is not None]
+        raise IncompleteError(f"{error}; wake-ups served late: {'; '.join(served)}") from error
     zero = time_zero_of(plan, hlc, gateway, rig.rows)
     cycles = duration_ns // plan.cycle_ns if hlc is None else int(hlc.cycles.size)
     timing = judge_timing(plan, zero, cycles, hlc, gateway, joints)
@@ -167,12 +203,16 @@ def _gather(rig: Supervisor, setup: Setup) -> RealTimeRun:
     return RealTimeRun(record, timing)
 
 
-def _check_expectations(scenario: Scenario, without: frozenset[str]) -> None:
-    """A foreign controller does not say what it follows."""
-    if "hlc" in without:
-        for line in scenario.expect:
-            if line.path.startswith("golden.tracking_rmse"):
-                raise BenchError(f"expect: {line.text!r} needs our controller, and it is left out; remove one of them")
+def check_expectations(scenario: Scenario, without: frozenset[str]) -> None:
+    """A foreign controller does not say what it follows, a foreign gateway not what it did: raises BenchError."""
+    for line in scenario.expect:
+        needed = ""
+        if "hlc" in without and line.path.startswith("golden.tracking_rmse"):
+            needed = "controller"
+        elif "gateway" in without and line.path == "injections":
+            needed = "gateway"
+        if needed:
+            raise BenchError(f"expect: {line.text!r} needs our {needed}, and it is left out; remove one of them")
 
 
 def _timing_entry(limits: TimingLimits, golden: Timing, faulted: Timing) -> RealTimeEntry:

@@ -1,7 +1,8 @@
 """Scenario files: what is on the rig, how it moves, what is injected, and what is expected of it.
 
 A file is read once, every complaint at once, into plain frozen data: times in ns, angles in rad. `resolved_yaml` writes
-that data back as a file, defaults filled in, which reads as an equal scenario.
+that data back as a file, defaults filled in, which reads as an equal scenario. A file of faults alone, for a gateway on
+real buses, is testbench.fault_file's.
 Left out: `rig: {file: ...}`, the walking plant, other motions than the recorded gait.
 """
 
@@ -27,15 +28,22 @@ from testbench.expect import Expectation, parse_expectation
 
 __all__ = [
     "JOINT_NAMES",
+    "Cycle",
     "Expectation",
     "Motion",
+    "Name",
+    "Pins",
     "RealTime",
     "Rig",
     "Scenario",
+    "Seed",
+    "check_file_injectors",
+    "check_rate",
     "default_joints",
     "describe",
     "load_scenario",
     "parse_scenario",
+    "scenario_in",
     "scenario_schema",
 ]
 
@@ -137,6 +145,16 @@ Pins: TypeAlias = Annotated[
     PlainSerializer(lambda on: "on" if on else "off"),
     WithJsonSchema({"enum": ["on", "off"]}),
 ]
+Name: TypeAlias = Annotated[str, BeforeValidator(_name)]
+Seed: TypeAlias = Annotated[int, BeforeValidator(_seed)]
+Cycle: TypeAlias = Annotated[
+    int,
+    BeforeValidator(_cycle),
+    PlainSerializer(_rate),
+    WithJsonSchema({"type": "string", "examples": ["500 Hz"]}),
+    Field(alias="rate", json_schema_extra={"default": "500 Hz"}),
+]
+"""Control cycle [ns], in a file the key `rate`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,13 +165,7 @@ class Rig(SpecModel):
 
     plant: Annotated[Literal["suspended"], Later(("walking",))]
     stops: Pins
-    cycle_ns: Annotated[
-        int,
-        BeforeValidator(_cycle),
-        PlainSerializer(_rate),
-        WithJsonSchema({"type": "string", "examples": ["500 Hz"]}),
-        Field(alias="rate", json_schema_extra={"default": "500 Hz"}),
-    ] = 2 * MS
+    cycle_ns: Cycle = 2 * MS
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,11 +195,11 @@ class Scenario(SpecModel):
     tolerance_rad: how far beyond the range of travel is not yet a failure; realtime: when a real-time run is invalid.
     """
 
-    name: Annotated[str, BeforeValidator(_name)]
+    name: Name
     rig: Rig
     motion: Motion
     description: Text = ""
-    seed: Annotated[int, BeforeValidator(_seed)] = 0
+    seed: Seed = 0
     injectors: dict[str, InjectorSpec] = field(default_factory=dict)
     expect: tuple[ExpectLine, ...] = ()
     fail_on: Literal["failure", "error"] = "failure"
@@ -218,7 +230,7 @@ def load_scenario(path: Path | str, overrides: Sequence[str] = ()) -> Scenario:
     document = load(path)
     for override in overrides:
         apply_override(document, override)
-    return _read(document)
+    return scenario_in(document)
 
 
 def parse_scenario(text: str, source: str = "scenario", overrides: Sequence[str] = ()) -> Scenario:
@@ -226,7 +238,7 @@ def parse_scenario(text: str, source: str = "scenario", overrides: Sequence[str]
     document = parse(text, source)
     for override in overrides:
         apply_override(document, override)
-    return _read(document)
+    return scenario_in(document)
 
 
 def scenario_schema() -> dict[str, Data]:
@@ -252,15 +264,24 @@ def describe(scenario: Scenario) -> list[str]:
     return lines
 
 
-def _read(document: Document) -> Scenario:
-    """Check shape, then sense; raises FileErrors."""
+def scenario_in(document: Document) -> Scenario:
+    """Check shape, then sense; raises FileErrors with everything that is wrong."""
     whole = validate(Scenario, document.data, (), document)
     data = document.data if isinstance(document.data, dict) else {}
     rig = validate(Rig, data.get("rig"), ("rig",), None)
     motion = validate(Motion, data.get("motion"), ("motion",), None)
     if rig is not None:
         _check_rig(rig, motion, document)
+    check_file_injectors(document)
+    document.raise_problems()
+    assert whole is not None
+    return whole
+
+
+def check_file_injectors(document: Document) -> None:
+    """Report what cannot work in a document's injectors, beyond their shape."""
     plan = BusPlan(default_joints())  # names and mappings do not hang on the rate, which may be wrong
+    data = document.data if isinstance(document.data, dict) else {}
     found = data.get("injectors")
     injectors = found if isinstance(found, dict) else {}
     for name in injectors:
@@ -268,9 +289,14 @@ def _read(document: Document) -> Scenario:
             text = f"{name!r} is no name; allowed are letters, digits, _ and -, at most 64"
             document.report(("injectors", name), text, at_key=True)
     check_injectors(injectors, plan, lambda keys, text: document.report(("injectors", *keys), text))
-    document.raise_problems()
-    assert whole is not None
-    return whole
+
+
+def check_rate(cycle_ns: int, document: Document) -> None:
+    """Report a rate at which the bus cannot carry what is due in a cycle."""
+    try:
+        BusPlan(default_joints(), cycle_ns=cycle_ns)
+    except CanopenExoError as error:
+        document.report(("rig", "rate"), str(error))
 
 
 def _check_rig(rig: Rig, motion: Motion | None, document: Document) -> None:
@@ -283,7 +309,4 @@ def _check_rig(rig: Rig, motion: Motion | None, document: Document) -> None:
         nearest = f"{format_duration(below)} or {format_duration(below + rig.cycle_ns)}"
         text = f"{format_duration(motion.stride_ns)} is not a whole number of control cycles of "
         document.report(("motion", "stride"), f"{text}{format_duration(rig.cycle_ns)}; nearest: {nearest}")
-    try:
-        BusPlan(default_joints(), cycle_ns=rig.cycle_ns)
-    except CanopenExoError as error:
-        document.report(("rig", "rate"), str(error))
+    check_rate(rig.cycle_ns, document)

@@ -3,19 +3,16 @@
 Hub (when no interface is named), joints, gateway, high-level controller. Each is ready when it is heard on CAN
 (testbench.watch); the hub, which is no CAN node, when it prints the address it listens on. One that ends unasked ends
 the rig: the others get the time their configured time-outs need to react by themselves, then all are stopped.
-Every process is a session of its own, so that Ctrl-C reaches the supervisor alone; on Linux the kernel ends them when
-the supervisor is killed, elsewhere they look for it themselves (the hub does not).
+On Linux the kernel ends the processes when the supervisor is killed, elsewhere they look for it themselves (the hub
+does not); they then also remove the rig's folder.
 Left out: starting a part again; a drive that came back would have to be configured and enabled anew.
 """
 
 import contextlib
 import os
 import signal
-import subprocess
-import sys
 import tempfile
 import time
-from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,9 +21,9 @@ from typing import Final, final
 
 from canopen_exo.bus.channel import Channel
 from canopen_exo.bus.medium import Transmission
-from canopen_exo.bus.node import MS, SECOND
+from canopen_exo.bus.node import MS, NEVER, SECOND
 from canopen_exo.bus.realtime import RealTimeLoop
-from testbench.errors import BenchError
+from testbench.child import Process, ProcessError
 from testbench.process import DONE, ENDED_EARLY, Orders, open_bus
 from testbench.scenario import Scenario
 from testbench.watch import CONTROLLER_PORT, DRIVE_PORT, Watch
@@ -37,18 +34,20 @@ PARTS: Final = ("joints", "gateway", "hlc")
 READY_NS: Final = 30 * SECOND
 """Most that a process may take to be heard: it imports MuJoCo on a machine that may be busy."""
 
+FOREIGN_READY_NS: Final = 60 * SECOND
+"""The same for foreign software, which somebody may start by hand; an endless rig waits for it until told to end."""
+
 REACT_NS: Final = SECOND
 """How long the others are left alone when one has died: longer than any time-out of drives and controller."""
 
 END_NS: Final = 10 * SECOND
 """Most that a process may take to end in order, its part of the result included."""
 
+SAYS_HUB: Final = "listening on "
+SAYS_CONTROL: Final = "gateway: live control at "
+"""How hub and gateway say where they listen."""
+
 _LOOK_NS: Final = 20 * MS
-_LAST_LINES: Final = 12
-
-
-class ProcessError(BenchError):
-    """A process did not become ready, or ended unasked; the message has its last lines."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,102 +72,12 @@ class Setup:
 
 
 @final
-class Process:
-    """A running process. name: hub or one of PARTS; lines: the last ones it printed. Its output is read by `listen`."""
-
-    def __init__(self, name: str, arguments: list[str], say: Callable[[str], None]) -> None:
-        self.name: Final[str] = name
-        self.lines: Final[deque[str]] = deque(maxlen=_LAST_LINES)
-        self.is_told: bool = False
-        self._say: Final[Callable[[str], None]] = say
-        self._rest: bytes = b""
-        self._is_closed: bool = False
-        self._running: Final[subprocess.Popen[bytes]] = subprocess.Popen(
-            [sys.executable, "-P", "-m", "testbench.cli", *arguments],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            start_new_session=True,
-        )
-        os.set_blocking(self.fileno(), False)
-
-    @property
-    def pid(self) -> int:
-        """Its process id."""
-        return self._running.pid
-
-    def wait(self, timeout_s: float) -> None:
-        """Until it ends, at most that long."""
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            self._running.wait(timeout_s)
-
-    @property
-    def code(self) -> int | None:
-        """Exit code, -N when signal N killed it; None while it runs."""
-        return self._running.poll()
-
-    def fileno(self) -> int:
-        """Of its output."""
-        assert self._running.stdout is not None
-        return self._running.stdout.fileno()
-
-    def listen(self) -> bool:
-        """Take what it has printed; False when there will be no more."""
-        while not self._is_closed:
-            try:
-                data = os.read(self.fileno(), 1 << 14)
-            except BlockingIOError:
-                return True
-            *lines, self._rest = (self._rest + data).split(b"\n")
-            if not data and self._rest:
-                lines.append(self._rest)
-                self._rest = b""
-            for line in lines:
-                text = line.decode(errors="replace").rstrip()
-                self.lines.append(text)
-                self._say(text)
-            if not data:
-                return False
-        return False
-
-    def tell(self, number: int) -> None:
-        """Send it a signal; from now on its end is expected."""
-        self.is_told = True
-        with contextlib.suppress(ProcessLookupError):
-            self._running.send_signal(number)
-
-    def close(self) -> None:
-        """Kill what is left of it."""
-        if self.code is None:
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(self.pid, signal.SIGKILL)
-        self._running.wait()
-        self.listen()
-        self._is_closed = True
-        assert self._running.stdout is not None
-        self._running.stdout.close()
-
-    def obituary(self) -> str:
-        """How it ended, and what it said last."""
-        code = self.code
-        if not self._is_closed:
-            self.listen()
-        if code is None:
-            how = "is running"
-        elif code < 0:
-            how = f"was killed by {signal.Signals(-code).name}"
-        else:
-            how = f"ended with exit code {code}"
-        said = "".join(f"\n  {line}" for line in self.lines)
-        return f"{self.name} {how}{'; its last lines:' + said if said else ''}"
-
-
-@final
 class Supervisor:
     """A rig of processes; a context manager that leaves none behind.
 
-    watch: the listener on both buses; processes: by name; folder: of this rig alone, removed at the end.
-    say: told each line that a process prints; tick: called with the loop's time at least every 50 ms.
+    watch: the listener on both buses; processes: by name.
+    say: told each line that a process prints; tick: called with the loop's time at least every 50 ms;
+    announce: told what foreign software is waited for, and where; hub: of another supervisor, watched and not ended.
     """
 
     def __init__(
@@ -176,6 +85,8 @@ class Supervisor:
         setup: Setup,
         say: Callable[[str], None] = lambda line: None,
         tick: Callable[[int], None] = lambda now: None,
+        announce: Callable[[str], None] = lambda text: None,
+        hub: Process | None = None,
     ) -> None:
         self.setup: Final[Setup] = setup
         self.watch: Final[Watch] = Watch(setup.scenario.plan)
@@ -183,6 +94,8 @@ class Supervisor:
         self.orders: Final[Orders] = Orders()
         self._say: Final[Callable[[str], None]] = say
         self._tick: Final[Callable[[int], None]] = tick
+        self._announce: Final[Callable[[str], None]] = announce
+        self._borrowed: Final[list[Process]] = [] if hub is None else [hub]
         self._temporary: Final = tempfile.TemporaryDirectory(prefix="exo-hil-")
         self._epoch_ns: Final[int] = time.monotonic_ns()
         self._cleaning: Final = contextlib.ExitStack()
@@ -217,8 +130,8 @@ class Supervisor:
         """
         setup = self.setup
         self._scenario_file.write_text(setup.scenario.resolved_yaml(), encoding="utf-8")
-        if setup.buses is None:
-            self._start_hub()
+        if setup.buses is None and not self._hub_address:
+            self.start_hub()
         for bus in self.buses:
             self._channels.append(open_bus(bus))
         record = setup.record or (setup.keep_parts and "gateway" in setup.without)
@@ -228,6 +141,19 @@ class Supervisor:
             if name in parts:
                 starts[name]()
         self._is_started = True
+
+    def start_hub(self) -> None:
+        """The hub alone, without listening on its buses; `start` does it where none are named. Raises as `start`."""
+        bitrate = str(self.setup.scenario.plan.bitrate)
+        arguments = ["--timed", "--listen", self.setup.listen, "--bitrate", bitrate, *self._supervised()]
+        hub = self._spawn("hub", arguments)
+        limit = self.now() + READY_NS
+        while not self._hub_address:
+            self._check_orders()
+            self._idle(hub)
+            self._hub_address = hub.said(SAYS_HUB)
+            if not self._hub_address and (hub.code is not None or self.now() >= limit):
+                raise ProcessError(f"the hub does not listen: {hub.obituary()}")
 
     def run(self, until: Callable[[int], bool]) -> None:
         """Listen until `until(now)`. Raises ProcessError when a process ends unasked, KeyboardInterrupt."""
@@ -263,6 +189,12 @@ class Supervisor:
     @property
     def control_address(self) -> str:
         """Of the gateway's live control; "" when there is none."""
+        if "gateway" in self.setup.without:
+            return ""
+        gateway = self.processes.get("gateway")
+        said = "" if gateway is None else gateway.said(SAYS_CONTROL)  # the port that was free, where 0 is asked for
+        if said:
+            return said
         if self.setup.control or os.name != "posix":
             return self.setup.control
         return str(Path(self._temporary.name) / "control")
@@ -289,18 +221,22 @@ class Supervisor:
 
     def _start_joints(self) -> None:
         if "joints" in self.setup.without:
+            self._announce(f"waiting for drives on {self.buses[1]}: they must answer SDO requests")
             self.watch.ask(self.now(), DRIVE_PORT)
         else:
             self._spawn("joints", ["--bus", self.buses[1], *self._common("joints")])
         self._await("joints", lambda: not self.watch.missing(DRIVE_PORT), self._missing_drives)
 
     def _start_gateway(self) -> None:
+        controller_bus, drive_bus = self.buses
         if "gateway" not in self.setup.without:
-            controller_bus, drive_bus = self.buses
             arguments = ["--controller-bus", controller_bus, "--drive-bus", drive_bus, *self._common("gateway")]
             if self.control_address:
                 arguments += ["--control", self.control_address]
             self._spawn("gateway", [*arguments, *([] if self.setup.faults else ["--no-faults"])])
+        else:
+            both = f"{controller_bus} and {drive_bus}"
+            self._announce(f"waiting for a gateway between {both}: it must pass SDO requests and answers")
         self.watch.ask(self.now(), CONTROLLER_PORT)
         self._await("gateway", lambda: not self.watch.missing(CONTROLLER_PORT), self._missing_answers)
 
@@ -309,16 +245,24 @@ class Supervisor:
             arguments = ["--bus", self.buses[0], *self._common("hlc")]
             self._spawn("hlc", [*arguments, *(["--endless"] if self.setup.endless else [])])
             self._await("hlc", lambda: self.watch.master_heard, lambda: "nothing of it was heard on the controller bus")
+        else:
+            start = f", or `exo-hil fault start --at {self.control_address}`" if self.control_address else ""
+            zero = f"time 0 is its status frame (COB-ID 0x2FF){start}"
+            self._announce(f"ready for a controller on {self.buses[0]}: {zero}")
 
     @property
     def _scenario_file(self) -> Path:
         return Path(self._temporary.name) / "scenario.yaml"
 
     def _common(self, name: str) -> list[str]:
-        arguments = [str(self._scenario_file), "--epoch", str(self._epoch_ns), "--supervisor", str(os.getpid())]
+        arguments = [str(self._scenario_file), "--epoch", str(self._epoch_ns), *self._supervised()]
         if self.setup.keep_parts:
             arguments += ["--part", str(self.part(name))]
         return arguments + (["--fifo"] if self.setup.fifo else [])
+
+    def _supervised(self) -> list[str]:
+        """Who supervises, and what to remove when he is gone."""
+        return ["--supervisor", str(os.getpid()), "--folder", self._temporary.name]
 
     def _spawn(self, name: str, arguments: list[str]) -> Process:
         self._check_orders()
@@ -332,28 +276,15 @@ class Supervisor:
         if not process.listen() and self._loop is not None:
             self._loop.remove_reader(process)
 
-    def _start_hub(self) -> None:
-        bitrate = str(self.setup.scenario.plan.bitrate)
-        arguments = ["--timed", "--listen", self.setup.listen, "--bitrate", bitrate, "--supervisor", str(os.getpid())]
-        hub = self._spawn("hub", arguments)
-        said = "listening on "
-        limit = self.now() + READY_NS
-        while not self._hub_address:
-            self._check_orders()
-            self._idle(hub)
-            for line in hub.lines:
-                if line.startswith(said):
-                    self._hub_address = line.removeprefix(said)
-            if not self._hub_address and (hub.code is not None or self.now() >= limit):
-                raise ProcessError(f"the hub does not listen: {hub.obituary()}")
-
     def _await(self, name: str, is_ready: Callable[[], bool], missing: Callable[[], str]) -> None:
         """Listen until that part of the rig is heard."""
-        limit = self.now() + READY_NS
+        is_foreign = name in self.setup.without
+        patience = FOREIGN_READY_NS if is_foreign else READY_NS
+        limit = NEVER if is_foreign and self.setup.endless else self.now() + patience
         self.run(lambda now: is_ready() or now >= limit)
         if not is_ready():
             said = f"; {self.processes[name].obituary()}" if name in self.processes else ""
-            raise ProcessError(f"{name}: not ready after {READY_NS / 1e9:g} s: {missing()}{said}")
+            raise ProcessError(f"{name}: not ready after {patience / 1e9:g} s: {missing()}{said}")
 
     def _missing_drives(self) -> str:
         missing = ", ".join(self.watch.missing(DRIVE_PORT))
@@ -374,7 +305,7 @@ class Supervisor:
             if now >= self._look_at:
                 self._look_at = now + _LOOK_NS
                 self._tick(now)
-                for process in self.processes.values():
+                for process in (*self.processes.values(), *self._borrowed):
                     if self._is_dead(process):
                         dead = process
                         return True

@@ -5,7 +5,8 @@ frames it received (time of arrival) and sent (time of sending), in the order of
 cycle through the rig is cut into steps: a process handles a frame, or a frame travels from one process to the next. A
 step that begins in a cycle and ends when the next SYNC was due, and already there, makes the cycle late by the
 difference. A SYNC itself makes its cycle late when it is on its way later than the next one was due.
-Steps between our own processes only: what foreign software does in between is not judged.
+Steps between our own processes only: what foreign software does in between is not judged. It has its own clock, too:
+what begins with a frame of foreign software is late when it is not at its end one cycle after that frame came.
 A fault on the wire is not lateness, whatever it drops or changes: steps are followed within one hop, and a fault acts
 between two of them.
 Leaves out: whatever is not synchronous (SYNC, PDOs, the controller's status) when it comes to lateness; loss is looked
@@ -21,7 +22,7 @@ from canopen_exo import plan as ids
 from canopen_exo.bus.frame import Frame
 from canopen_exo.bus.lateness import Lateness
 from canopen_exo.bus.medium import Transmission
-from canopen_exo.bus.node import MS
+from canopen_exo.bus.node import MS, NEVER
 from canopen_exo.plan import BusPlan
 from testbench.parts import GatewayPart, HlcPart, JointsPart
 
@@ -84,7 +85,8 @@ class _Judge:
     """Collects late cycles. zero_ns: time 0; cycles: of the motion.
 
     A frame belongs to the cycle whose SYNC began what made it. The number is handed on from row to row, along the way
-    of the frame; where the way begins in foreign software, it is the cycle in which the row lies.
+    of the frame; where the way begins in foreign software, it is the cycle in which the row lies. When that was is
+    handed on as well.
     """
 
     def __init__(self, zero_ns: int, cycle_ns: int, cycles: int) -> None:
@@ -93,15 +95,23 @@ class _Judge:
         self.cycles: Final = cycles
         self.late: dict[int, int] = {}
         self.worst: str = ""
-        self._numbers: Final[dict[int, int]] = {}  # by id() of the row; the parts keep the rows
+        self._ways: Final[dict[int, tuple[int, int]]] = {}  # by id() of the row; the parts keep the rows
 
-    def number(self, row: Transmission, cycle: int) -> None:
-        """The row belongs to that cycle."""
-        self._numbers[id(row)] = cycle
+    def begin(self, row: Transmission, cycle: int) -> None:
+        """The way of a frame begins with this row of our controller, in that cycle."""
+        self._ways[id(row)] = (cycle, NEVER)
+
+    def follow(self, row: Transmission, before: Transmission) -> None:
+        """The way of a frame, or what it began, goes on from one row to the next."""
+        self._ways[id(row)] = self._way(before)
 
     def cycle(self, row: Transmission) -> int:
         """The cycle a row belongs to."""
-        return self._numbers.get(id(row), (row.end_ns - self.zero_ns) // self.cycle_ns)
+        return self._way(row)[0]
+
+    def _way(self, row: Transmission) -> tuple[int, int]:
+        """(cycle, when the way began in foreign software [ns]; NEVER: in our controller, on the grid from time 0)."""
+        return self._ways.get(id(row), ((row.end_ns - self.zero_ns) // self.cycle_ns, row.end_ns))
 
     def syncs(self, rows: list[Transmission], bus: int) -> dict[int, int]:
         """Cycle -> when its SYNC was on that bus, as one process saw or sent it [ns]."""
@@ -113,11 +123,12 @@ class _Judge:
 
     def judge(self, row: Transmission, what: str, syncs: dict[int, int]) -> None:
         """A step ended with this row. syncs: on its bus; when the next one came, a SYNC itself is judged by its due."""
-        cycle = self.cycle(row)
+        cycle, begun_ns = self._way(row)
         if not 0 <= cycle < self.cycles:
             return
-        due_ns = self.zero_ns + (cycle + 1) * self.cycle_ns
-        if row.frame.can_id != ids.SYNC:
+        is_ours = begun_ns == NEVER
+        due_ns = self.zero_ns + (cycle + 1) * self.cycle_ns if is_ours else begun_ns + self.cycle_ns
+        if is_ours and row.frame.can_id != ids.SYNC:
             due_ns = max(due_ns, syncs.get(cycle + 1, due_ns))
         by_ns = row.end_ns - due_ns
         if by_ns > 0:
@@ -198,7 +209,7 @@ def _controller(judge: _Judge, rows: list[Transmission], commands: set[int]) -> 
     for row in own:
         if row.frame.can_id == ids.SYNC:
             cycle += 1
-        judge.number(row, cycle)
+        judge.begin(row, cycle)
     syncs = judge.syncs(own, 0)
     for row in own:
         judge.judge(row, "controller sent", syncs)
@@ -207,15 +218,15 @@ def _controller(judge: _Judge, rows: list[Transmission], commands: set[int]) -> 
 def _drives(judge: _Judge, rows: list[Transmission], answers: set[int]) -> None:
     """The answers that follow a SYNC in the order of handling are those to it."""
     syncs = judge.syncs(rows, 0)
-    cycle = -1
+    sync: Transmission | None = None
     for row in rows:
         frame = row.frame
         if frame.flags:
             continue
         if row.sender < 0 and frame.can_id == ids.SYNC:
-            cycle = judge.cycle(row)
-        elif row.sender >= 0 and frame.can_id in answers:
-            judge.number(row, cycle)
+            sync = row
+        elif row.sender >= 0 and frame.can_id in answers and sync is not None:
+            judge.follow(row, sync)
             judge.judge(row, "joints sent", syncs)
 
 
@@ -232,7 +243,7 @@ def _gateway(judge: _Judge, rows: list[Transmission], wanted: set[int]) -> None:
         else:
             arrival = came.pop(frame.can_id, None)
             if arrival is not None and arrival.bus != row.bus:
-                judge.number(row, judge.cycle(arrival))
+                judge.follow(row, arrival)
                 passed.append(row)
     syncs = (judge.syncs(rows, CONTROLLER_BUS), judge.syncs(rows, DRIVE_BUS))
     for row in passed:
@@ -264,7 +275,7 @@ def _travel(judge: _Judge, bus: str, sender: _End | None, receiver: _End | None,
             problems.append(f"{can_id:03X} ({len(departures)} sent, {len(arrivals)} received)")
         elif flags == 0 and can_id in wanted:
             for departure, arrival in zip(departures[first:], arrivals, strict=False):
-                judge.number(arrival, judge.cycle(departure))
+                judge.follow(arrival, departure)
             arrived += arrivals
     syncs = judge.syncs(receiver.rows, receiver.bus)
     for row in arrived:

@@ -2,14 +2,15 @@
 
 Source: python-can 4.6, `can.BusABC`. The one place, beside the hub's plug-in, that imports python-can.
 A bus without a file descriptor is asked every millisecond. A send that fails is tried again for 100 ms, then the frame
-is lost and counted and the interface counts as down; a bus that fails to read is closed and opened again with a
-back-off of 0.1 s to 2 s.
-Leaves out: sending the raw DLC 9..15 of a classical frame, on which several interfaces fail (it goes as 8), and stamps
-of a device's own clock, which start anywhere: those frames get the time of reading.
+is lost and counted, the interface counts as down; a CAN FD frame on a bus that cannot carry it is lost at once. A bus
+that fails to read is closed and opened again with a back-off of 0.1 s to 2 s.
+Leaves out: sending the raw DLC 9..15 of a frame, on which several interfaces fail (it goes as 8, which the receivers'
+data do not show), and stamps of a device's own clock, which start anywhere: those frames get the time of reading.
 """
 
 import configparser
 import contextlib
+import errno
 import sys
 import time
 from collections.abc import Callable
@@ -198,7 +199,7 @@ class PythonCanChannel(Channel):
             self.lost += 1
             return True
         except (can.CanError, OSError) as error:
-            return self._refused(error)
+            return self._refused(bus, frame, error)
         if self._failing_since != NEVER or self._is_down:
             self._failing_since = NEVER
             self._note(ErrorState.ERROR_ACTIVE, "sending again", time.monotonic_ns() - self.epoch_ns)
@@ -210,8 +211,16 @@ class PythonCanChannel(Channel):
         self.poll_at = NEVER
         self._drop()
 
-    def _refused(self, error: Exception) -> bool:
-        """A send failed: most interfaces do not say whether their queue is full or the bus is gone; time tells."""
+    def _refused(self, bus: can.BusABC, frame: Frame, error: Exception) -> bool:
+        """A send failed: most interfaces do not say whether their queue is full or the bus is gone; time tells.
+
+        CAN FD is another matter: a bus that is not open for it, or says EINVAL, will not take the frame later either.
+        """
+        if frame.flags & FLAG_FD:
+            code = error.errno if isinstance(error, OSError) else getattr(error, "error_code", None)
+            if code == errno.EINVAL or bus.protocol is can.CanProtocol.CAN_20:
+                self.lost += 1
+                return True
         now = time.monotonic_ns() - self.epoch_ns
         if self._failing_since == NEVER:
             self._failing_since = now

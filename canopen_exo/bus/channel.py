@@ -13,11 +13,14 @@ from typing import Final, final
 from mypy_extensions import mypyc_attr
 
 from canopen_exo.bus.frame import Frame
-from canopen_exo.bus.node import NEVER, PortState
+from canopen_exo.bus.node import MS, NEVER, PortState
 
-_COMPARISONS: Final = 3
-_COMPARED_WITHIN_NS: Final = 200_000
-"""A process that is interrupted between two clocks compares them again, twice at most."""
+_COMPARISONS: Final = 5
+_COMPARED_WITHIN_NS: Final = 5_000
+"""A process that is interrupted between two clocks compares them again, four times at most; the closest counts."""
+
+_COMPARED_FOR_NS: Final = MS
+"""How long a comparison holds: a wall clock that is being slewed drifts by 0.5 us in it (500 ppm, adjtimex(2))."""
 
 
 @final
@@ -70,22 +73,59 @@ class Channel:
         """Let the interface go; a second call does nothing."""
         raise NotImplementedError
 
+    def count_overruns(self) -> None:
+        """Bring `overruns` up to date, where it is told with the next frame only; for statistics, not per frame."""
+
+
+RecordArrival = tuple[int, int, int, bytes, Arrival | None]
+"""What came, undecoded: stamp [ns], the `place` given, CAN id and record of a base data frame (11-bit id, 0..8 bytes),
+None; for all else id -1, no record, and the Arrival. A plain tuple: one is made for every frame of a full gateway."""
+
+
+@mypyc_attr(allow_interpreted_subclasses=True)
+class RecordChannel(Channel):
+    """A channel whose frames can go, as the bytes that came, to another channel of the same class."""
+
+    def receive_records(self, place: int) -> list[RecordArrival]:
+        """As `receive`, undecoded. place: put into every tuple."""
+        raise NotImplementedError
+
+    def send_record(self, record: bytes) -> bool:
+        """As `send`, with a record that such a channel received."""
+        raise NotImplementedError
+
+    def frame_in(self, record: bytes) -> Frame:
+        """The frame in the record of a RecordArrival."""
+        raise NotImplementedError
+
 
 @final
 class StampClock:
     """Stamps of CLOCK_REALTIME (the kernel's, python-can's) on the loop's clock.
 
-    Both clocks are compared anew for every batch, so a corrected wall clock does no harm: a stamp lies between the
-    one before it and now, whatever the wall clock did meanwhile.
+    Both clocks are compared anew for every batch, at most once a millisecond, so a corrected wall clock does no harm: a
+    stamp lies between the one before it and now, whatever the wall clock did meanwhile.
+    now: of the last `begin`; offset: what to take from a stamp, ns; last: the stamp given last. A channel that reads
+    many stamps at once does what `at` does by itself.
     """
 
     def __init__(self) -> None:
-        self._now: int = 0
-        self._offset: int = 0
-        self._last: int = -NEVER
+        self.now: int = 0
+        self.offset: int = 0
+        self.last: int = -NEVER
+        self._epoch_ns: int = 0
+        self._compare_at: int = -NEVER
 
     def begin(self, epoch_ns: int) -> int:
-        """Compare the clocks; returns now on the loop's clock [ns]."""
+        """Compare the clocks when it is time to; returns now on the loop's clock [ns]."""
+        after = time.monotonic_ns()
+        if after >= self._compare_at or epoch_ns != self._epoch_ns:
+            after = self._compare(epoch_ns)
+        self.now = after - epoch_ns
+        return self.now
+
+    def _compare(self, epoch_ns: int) -> int:
+        """Find the difference of the clocks; returns CLOCK_MONOTONIC."""
         tightest = NEVER
         for _ in range(_COMPARISONS):
             before = time.monotonic_ns()
@@ -93,18 +133,19 @@ class StampClock:
             after = time.monotonic_ns()
             if after - before < tightest:
                 tightest = after - before
-                self._offset = wall - (before + after) // 2 + epoch_ns
+                self.offset = wall - (before + after) // 2 + epoch_ns
             if tightest < _COMPARED_WITHIN_NS:
                 break
-        self._now = after - epoch_ns
-        return self._now
+        self._epoch_ns = epoch_ns
+        self._compare_at = after + _COMPARED_FOR_NS
+        return after
 
     def at(self, realtime_ns: int) -> int:
         """A stamp of CLOCK_REALTIME [ns] on the loop's clock."""
-        stamp = realtime_ns - self._offset
-        if stamp > self._now:
-            stamp = self._now
-        if stamp < self._last:
-            stamp = self._last
-        self._last = stamp
+        stamp = realtime_ns - self.offset
+        if stamp > self.now:
+            stamp = self.now
+        if stamp < self.last:
+            stamp = self.last
+        self.last = stamp
         return stamp

@@ -303,11 +303,13 @@ def hub_main(listen_on: str, timed: bool, bitrate: int) -> int:
 
 @contextlib.contextmanager
 def _signals() -> Iterator[socket.socket]:
-    """A socket that becomes readable with SIGINT or SIGTERM."""
+    """A socket that becomes readable with SIGINT, SIGTERM or SIGHUP."""
     stop, wake = socket.socketpair()
     wake.setblocking(False)
     before_fd = signal.set_wakeup_fd(wake.fileno(), warn_on_full_buffer=False)
-    wanted = (signal.SIGINT, signal.SIGTERM)
+    wanted = [signal.SIGINT, signal.SIGTERM]
+    if sys.platform != "win32":
+        wanted.append(signal.SIGHUP)
     before = [signal.signal(number, lambda *_: None) for number in wanted]
     try:
         yield stop

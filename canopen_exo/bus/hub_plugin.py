@@ -7,6 +7,7 @@ linux/can/error.h) and in `overruns` and `overflows`.
 Leaves out: filters in the hub (python-can filters here), bus state and error counters (a hub has none).
 """
 
+import logging
 import os
 import select
 import sys
@@ -38,6 +39,7 @@ from canopen_exo.bus.hub_wire import (
     OPTION_OWN,
     RECORD_SIZE,
     SHORT,
+    SHORT_RECORD,
     frame_fault,
     pack_record,
     unpack_record,
@@ -48,6 +50,9 @@ from canopen_exo.errors import CanopenExoError
 
 _OVERFLOW_CLASS: Final = 0x004
 """linux/can/error.h: CAN_ERR_CRTL; data[1] = 1: receive buffer overflow, 2: transmit buffer overflow."""
+
+_LOG: Final = logging.getLogger("can.bus")
+"""python-can's own logger of what is received."""
 
 _KEPT: Final = 1 << 16
 """Messages kept for a program that sends only: `send` reads the confirmations, and with them what else has come."""
@@ -96,15 +101,7 @@ class HubBus(can.BusABC):
 
         Raises can.CanOperationError when the hub has gone, refuses the frame, or has not taken it in time.
         """
-        try:
-            record = _pack(msg)
-        except (ValueError, TypeError) as error:
-            raise can.CanOperationError(f"{self.channel_info}: {error}") from error
-        fault = frame_fault(record, 0)
-        if not fault and self._is_timed and (msg.is_fd or msg.is_error_frame):
-            fault = "a timed hub emulates classical CAN and carries neither CAN FD nor error frames; use a fast hub"
-        if fault:
-            raise can.CanOperationError(f"{self.channel_info}: not sent: {fault}")
+        record = _pack_plain(msg) or self._pack_any(msg)
         deadline = None if timeout is None else time.monotonic() + timeout
         if not self._sending.acquire(timeout=-1 if timeout is None else max(timeout, 0.0)):
             raise can.CanOperationError(f"{self.channel_info}: another thread has been sending for {timeout} s")
@@ -115,6 +112,19 @@ class HubBus(can.BusABC):
         finally:
             self._sending.release()
 
+    def _pack_any(self, msg: can.Message) -> bytes:
+        """A message of any kind as a record. Raises can.CanOperationError when the hub would not carry it."""
+        try:
+            record = _pack(msg)
+        except (ValueError, TypeError) as error:
+            raise can.CanOperationError(f"{self.channel_info}: {error}") from error
+        fault = frame_fault(record, 0)
+        if not fault and self._is_timed and (msg.is_fd or msg.is_error_frame):
+            fault = "a timed hub emulates classical CAN and carries neither CAN FD nor error frames; use a fast hub"
+        if fault:
+            raise can.CanOperationError(f"{self.channel_info}: not sent: {fault}")
+        return record
+
     def _hand_over(self, record: bytes, deadline: float | None) -> None:
         if self._is_timed and not self._attend(self._has_room, deadline):
             raise can.CanOperationError(f"{self.channel_info}: transmit queue still full after the timeout")
@@ -124,8 +134,20 @@ class HubBus(can.BusABC):
         if self._is_timed:
             with self._turn:
                 self._underway += 1
-        while not self._link.flush():
+        while self._link.is_partial() and not self._link.flush():
             self._wait_writable(deadline)
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        """The next message, None after `timeout` s without one. Raises can.CanOperationError.
+
+        As python-can's own, which takes eight times as long to give what was read already.
+        """
+        if self._watch is None and not self._filters and not _LOG.isEnabledFor(self.RECV_LOGGING_LEVEL):
+            try:
+                return self._received.popleft()
+            except IndexError:
+                pass
+        return super().recv(timeout)
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
         received = self._received
@@ -228,7 +250,11 @@ class HubBus(can.BusABC):
                 size = RECORD_SIZE[kind]
                 if end - at < size:
                     break
-                self._take(data, at, kind)
+                message = _unpack_plain(data, at, self._realtime_offset, self.channel) if kind == KIND_FRAME else None
+                if message is not None and len(self._received) < _KEPT:
+                    self._received.append(message)
+                else:
+                    self._take(data, at, kind)
                 at += size
             self._link.rest = data[at:]
         except CanopenExoError as error:
@@ -342,18 +368,39 @@ def _pack(msg: can.Message) -> bytes:
     return pack_record(msg.arbitration_id, flags, dlc, data)
 
 
+def _pack_plain(msg: can.Message) -> bytes:
+    """A base data frame, which nearly every message is, as a record; b"" for anything else."""
+    can_id = msg.arbitration_id
+    data = msg.data
+    size = len(data)
+    if (
+        msg.is_extended_id
+        or msg.is_fd
+        or msg.is_remote_frame
+        or msg.is_error_frame
+        or size > 8
+        or msg.dlc != size
+        or not 0 <= can_id <= 0x7FF
+    ):
+        return b""
+    return SHORT_RECORD.pack(KIND_FRAME, 0, size, size, can_id, 0, data)
+
+
+def _unpack_plain(data: bytes, at: int, realtime_offset: int, channel: str) -> can.Message | None:
+    """The message of the frame record at `at` when it is a base data frame and well made; else None."""
+    _, flags, dlc, size, can_id, stamp, payload = SHORT_RECORD.unpack_from(data, at)
+    if flags or dlc != size or size > 8 or can_id > 0x7FF:
+        return None
+    if size < 8:
+        if any(payload[size:]):
+            return None
+        payload = payload[:size]
+    return can.Message((stamp + realtime_offset) / 1e9, can_id, False, False, False, channel, size, payload)
+
+
 def _unpack(data: bytes, at: int, realtime_offset: int, channel: str) -> can.Message:
     """The message of a frame record. timestamp: Unix time of the hub's stamp, seconds."""
     can_id, flags, dlc, payload, stamp = unpack_record(data, at)
-    if not flags & ~FLAG_EXTENDED:  # nearly every one
-        return can.Message(
-            timestamp=(stamp + realtime_offset) / 1e9,
-            arbitration_id=can_id,
-            is_extended_id=flags != 0,
-            dlc=dlc,
-            data=payload,
-            channel=channel,
-        )
     return can.Message(
         timestamp=(stamp + realtime_offset) / 1e9,
         arbitration_id=can_id,

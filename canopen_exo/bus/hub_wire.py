@@ -58,7 +58,8 @@ STAMP: Final = struct.Struct("<q")
 STAMP_AT: Final = 8
 
 _HEAD: Final = struct.Struct("<BBBBIq")
-_SHORT: Final = struct.Struct("<BBBBIq8s")
+SHORT_RECORD: Final = struct.Struct("<BBBBIq8s")
+"""Kind, flags, DLC, size, id, stamp and payload of a record of `SHORT` bytes."""
 _LONG: Final = struct.Struct("<BBBBIq64s")
 _TEXT: Final = struct.Struct("<BBBBIq240s")
 _WORDS: Final = struct.Struct("<II")
@@ -119,7 +120,7 @@ def pack_record(can_id: int, flags: int, dlc: int, data: bytes, stamp: int = 0) 
     """A frame record. The caller answers for the parts; what is not a frame is refused by the other end."""
     if flags & FLAG_FD:
         return _LONG.pack(KIND_FD_FRAME, flags, dlc, len(data), can_id, stamp, data)
-    return _SHORT.pack(KIND_FRAME, flags, dlc, len(data), can_id, stamp, data)
+    return SHORT_RECORD.pack(KIND_FRAME, flags, dlc, len(data), can_id, stamp, data)
 
 
 def pack_frame(frame: Frame, stamp: int = 0) -> bytes:
@@ -145,7 +146,7 @@ def unpack_record(buffer: bytes, at: int) -> tuple[int, int, int, bytes, int]:
 
 def pack_count(kind: int, flags: int, count: int) -> bytes:
     """A sent or overrun record: how many frames."""
-    return _SHORT.pack(kind, flags, 0, 0, min(count, 0xFFFFFFFF), 0, b"")
+    return SHORT_RECORD.pack(kind, flags, 0, 0, min(count, 0xFFFFFFFF), 0, b"")
 
 
 def pack_text(kind: int, text: str) -> bytes:

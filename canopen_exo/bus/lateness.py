@@ -36,12 +36,14 @@ class Lateness:
 
     def add(self, delay_ns: int) -> None:
         """Count one delay; a negative one counts as 0."""
-        if delay_ns < 0:
-            delay_ns = 0
+        self.count += 1
         if delay_ns > self.worst_ns:
             self.worst_ns = delay_ns
-        self.count += 1
-        self._bins[_bin(delay_ns)] += 1
+        if 15 < delay_ns <= _TOP_NS:  # as `_bin`: this runs for every frame of a gateway
+            octave = delay_ns.bit_length() - 4
+            self._bins[(octave << 3) + (delay_ns >> octave)] += 1
+        else:
+            self._bins[_bin(delay_ns if delay_ns > 0 else 0)] += 1
 
     def percentile(self, share: float) -> int:
         """The delay [ns] that at least `share` (0..1) of the values do not exceed: its bin's upper edge."""
@@ -61,6 +63,11 @@ class Lateness:
         self.worst_ns = max(self.worst_ns, other.worst_ns)
         for index in range(_BINS):
             self._bins[index] += other._bins[index]
+
+    def words(self) -> str:
+        """For people, in ms."""
+        shares = ", ".join(f"{share} % within {self.percentile(share / 100) / 1e6:.1f} ms" for share in (50, 90, 99))
+        return f"{self.count}, {shares}, the latest {self.worst_ns / 1e6:.1f} ms"
 
     def document(self) -> LatenessDocument:
         """For JSON."""

@@ -8,6 +8,9 @@ processes of a rig share; only this module and the channels read it. Between two
 2. serves the wake-ups that are due; 3. delivers own frames to the node's other ports on a shared channel;
 4. sends what had to wait; 5. calls the further readers (live control).
 
+A Relay between two channels that carry records (SocketCAN) is served in the same order, but a frame it would only pass
+on goes as the record that came, and nothing is made of it. With a trace to keep, every frame is made and handled.
+
 `now` never goes back for a frame: one whose stamp is older than what was served already gets that time (its trace row
 keeps the stamp). Deviation from the lock-step order: within one channel frames keep the order in which they came, also
 where stamps are equal; on a real bus no two frames end at once.
@@ -22,13 +25,14 @@ import logging
 import select
 import time
 from collections.abc import Callable
+from operator import itemgetter
 from typing import Final, Protocol, final
 
-from canopen_exo.bus.channel import Arrival, Channel
-from canopen_exo.bus.frame import Frame
+from canopen_exo.bus.channel import Arrival, Channel, RecordArrival, RecordChannel
 from canopen_exo.bus.lateness import Lateness
-from canopen_exo.bus.medium import QUEUE_LENGTH, Transmission
-from canopen_exo.bus.node import MS, NEVER, SECOND, ErrorState, Node, Out, PortState
+from canopen_exo.bus.medium import Transmission
+from canopen_exo.bus.node import MS, NEVER, SECOND, Node, PortState, Relay
+from canopen_exo.bus.realtime_out import Line, RealTimeOut
 from canopen_exo.bus.scheduling import request_fifo, sharpen_timers
 from canopen_exo.errors import CanopenExoError
 
@@ -43,6 +47,8 @@ _CHECK_NS: Final = 50 * MS
 _RETRY_NS: Final = MS
 """How soon a frame is offered again to an interface that select cannot watch."""
 
+_BY_STAMP: Final = itemgetter(0)
+
 _LOG: Final = logging.getLogger(__name__)
 
 Wait = Callable[[list[int], list[int], float], tuple[list[int], list[int]]]
@@ -54,105 +60,6 @@ class Readable(Protocol):
 
     def fileno(self) -> int:
         """Its file descriptor."""
-
-
-@final
-class _Waiting:
-    """A frame that could not be sent yet. handled_ns: as `RealTimeOut.handled_ns` when it was given."""
-
-    __slots__ = ("frame", "handled_ns", "port")
-
-    def __init__(self, frame: Frame, port: int, handled_ns: int) -> None:
-        self.frame: Final[Frame] = frame
-        self.port: Final[int] = port
-        self.handled_ns: Final[int] = handled_ns
-
-
-@final
-class _Echo:
-    """A frame of ours on its way to the node's other port on the same channel."""
-
-    __slots__ = ("frame", "port", "sent_ns")
-
-    def __init__(self, sent_ns: int, port: int, frame: Frame) -> None:
-        self.sent_ns: Final[int] = sent_ns
-        self.port: Final[int] = port
-        self.frame: Final[Frame] = frame
-
-
-@final
-class _Line:
-    """A channel with the node's ports on it and the frames that wait for it, in the order in which they will go."""
-
-    __slots__ = ("channel", "fd", "index", "latency", "ports", "state", "waiting")
-
-    def __init__(self, index: int, channel: Channel) -> None:
-        self.index: Final[int] = index
-        self.channel: Final[Channel] = channel
-        self.ports: Final[list[int]] = []
-        self.waiting: Final[list[_Waiting]] = []
-        self.latency: Final[Lateness] = Lateness()
-        self.state: ErrorState = ErrorState.ERROR_ACTIVE
-        self.fd: int = -1
-
-
-@final
-class RealTimeOut(Out):
-    """The transmit side of the node. handled_ns: stamp of the frame being handled, NEVER outside of `receive`."""
-
-    def __init__(
-        self, clock: Callable[[], int], epoch_ns: int, trace: list[Transmission] | None, measure: bool
-    ) -> None:
-        self.lines: Final[list[_Line]] = []
-        self.echoes: list[_Echo] = []
-        self.dropped: Final[list[int]] = []
-        self.handled_ns: int = NEVER
-        self._clock: Final = clock
-        self._epoch_ns: Final[int] = epoch_ns
-        self._trace: Final = trace
-        self._measure: Final[bool] = measure
-
-    def send(self, port: int, frame: Frame) -> None:
-        """To the channel at once; into the queue of 64 while it would block; a full queue drops and counts it."""
-        line = self.lines[port]
-        if line.waiting or not self._try(line, port, frame, self.handled_ns):
-            waiting = line.waiting
-            at = len(waiting)
-            if at >= QUEUE_LENGTH:
-                self.dropped[port] += 1
-                return
-            arbitration = frame.arbitration
-            while at and waiting[at - 1].frame.arbitration > arbitration:
-                at -= 1
-            waiting.insert(at, _Waiting(frame, port, self.handled_ns))
-
-    def flush(self, line: _Line) -> None:
-        """Offer what waits, until it would block again."""
-        waiting = line.waiting
-        while waiting:
-            first = waiting[0]
-            if not self._try(line, first.port, first.frame, first.handled_ns):
-                return
-            waiting.pop(0)
-
-    def _try(self, line: _Line, port: int, frame: Frame, handled_ns: int) -> bool:
-        channel = line.channel
-        lost = channel.lost
-        shared = len(line.ports) > 1
-        now = 0
-        if shared or self._trace is not None:  # before the call: afterwards the frame may have arrived long ago
-            now = self._clock() - self._epoch_ns
-        if not channel.send(frame):
-            return False
-        if channel.lost != lost:
-            return True
-        if self._trace is not None:
-            self._trace.append(Transmission(now, line.index, frame, port))
-        if self._measure and handled_ns != NEVER:
-            line.latency.add(self._clock() - self._epoch_ns - handled_ns)
-        if shared:
-            self.echoes.append(_Echo(now, line.ports[1] if line.ports[0] == port else line.ports[0], frame))
-        return True
 
 
 def wait_select(readers: list[int], writers: list[int], timeout_s: float) -> tuple[list[int], list[int]]:
@@ -201,17 +108,20 @@ class RealTimeLoop:
         self._clock: Final = clock
         self._wait: Final = wait
         self._out: Final[RealTimeOut] = RealTimeOut(clock, epoch_ns, self.trace, measure_latency)
-        self._lines: Final[list[_Line]] = []
+        self._lines: Final[list[Line]] = []
         self._readers: Final[dict[int, Callable[[int], None]]] = {}
         self._served: int = -NEVER
         for index, channel in enumerate(channels):
             channel.epoch_ns = epoch_ns
-            self._lines.append(_Line(index, channel))
+            self._lines.append(Line(index, channel))
         for port, index in enumerate(ports):
             self._lines[index].ports.append(port)
             self._out.lines.append(self._lines[index])
             self._out.dropped.append(0)
         self.dropped: Final[list[int]] = self._out.dropped
+        self._records: Final[list[RecordChannel]] = self._record_channels(node, ports)
+        self._relay: Final[Relay | None] = node if isinstance(node, Relay) and self._records else None
+        self._measure: Final[bool] = measure_latency
 
     @property
     def latency(self) -> list[Lateness]:
@@ -226,6 +136,7 @@ class RealTimeLoop:
         """Frames lost so far, either way: in full queues, by the kernel or the hub, at an absent interface."""
         lost = sum(self.dropped)
         for line in self._lines:
+            line.channel.count_overruns()
             lost += line.channel.overruns + line.channel.lost
         return lost
 
@@ -246,6 +157,8 @@ class RealTimeLoop:
             while not until(self.now()):
                 self._turn()
         finally:
+            for line in self._lines:
+                line.channel.count_overruns()
             if collecting:
                 gc.enable()
 
@@ -255,8 +168,11 @@ class RealTimeLoop:
         writers: list[int] = []
         timeout_ns = self._prepare(self.now(), readers, writers)
         readable, writable = self._wait(readers, writers, timeout_ns / SECOND)
-        now = self.now()
-        self._serve_arrivals(now, readable)
+        now = self._clock() - self.epoch_ns
+        if self._relay is None:
+            self._serve_arrivals(now, readable)
+        else:
+            self._serve_records(self._relay, now, readable)
         self._serve_wakes(now)
         if self._out.echoes:
             self._serve_echoes()
@@ -321,7 +237,56 @@ class RealTimeLoop:
             for arrival in first:
                 self._deliver(line, arrival, latest)
 
-    def _deliver(self, line: _Line, arrival: Arrival, latest: int) -> None:
+    def _record_channels(self, node: Node, ports: list[int]) -> list[RecordChannel]:
+        """The two channels of a Relay, where records can go from one to the other and no trace wants frames."""
+        if not isinstance(node, Relay) or self.trace is not None or ports != [0, 1] or len(self._lines) != 2:
+            return []
+        channels = [line.channel for line in self._lines]
+        found = [channel for channel in channels if isinstance(channel, RecordChannel)]
+        return found if len(found) == 2 and type(found[0]) is type(found[1]) else []
+
+    def _serve_records(self, relay: Relay, now: int, readable: list[int]) -> None:
+        """As `_serve_arrivals`; what `relay` only passes on goes through here."""
+        found: list[RecordArrival] = []
+        place = -1
+        for channel in self._records:
+            place += 1
+            if self._lines[place].fd in readable or channel.poll_at <= now:
+                batch = channel.receive_records(place)
+                if found and batch:  # each is in order by itself; where stamps are equal the first channel comes first
+                    found += batch
+                    found.sort(key=_BY_STAMP)
+                elif batch:
+                    found = batch
+        for stamp, place, can_id, record, arrival in found:
+            if arrival is None:
+                if (
+                    relay.passes[place][can_id]
+                    and not relay.is_disturbed
+                    and relay.wake_at >= stamp
+                    and self._pass_on(stamp, 1 - place, record)
+                ):
+                    relay.frames[place] += 1
+                    continue
+                arrival = Arrival(stamp, self._records[place].frame_in(record), None)
+            self._deliver(self._lines[place], arrival, stamp)
+
+    def _pass_on(self, stamp: int, place: int, record: bytes) -> bool:
+        """Send a record on the channel `place`; False when it has to wait, as a frame."""
+        line = self._lines[place]
+        channel = self._records[place]
+        if line.waiting:
+            return False
+        lost = channel.lost
+        if not channel.send_record(record):
+            return False
+        if stamp > self._served:
+            self._served = stamp
+        if self._measure and channel.lost == lost:
+            line.latency.add(self._clock() - self.epoch_ns - stamp)
+        return True
+
+    def _deliver(self, line: Line, arrival: Arrival, latest: int) -> None:
         """Give one arrival to the node. latest: no stamp counts as later than this, the time at which all had come."""
         now = arrival.stamp_ns
         if now > latest:
@@ -342,7 +307,7 @@ class RealTimeLoop:
         elif arrival.state is not None:
             self._notify(line, arrival.state, now)
 
-    def _notify(self, line: _Line, state: PortState, now: int) -> None:
+    def _notify(self, line: Line, state: PortState, now: int) -> None:
         """Every port of the node on this channel shares its state."""
         changed = state.state is not line.state
         line.state = state.state

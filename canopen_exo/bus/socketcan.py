@@ -2,9 +2,12 @@
 
 Source: the kernel's Documentation/networking/can.rst; linux/can.h, linux/can/raw.h; socket(7). Records are the kernel's
 structures: can_frame (16 bytes) and canfd_frame (72 bytes), in the machine's byte order.
-A frame costs one recvmsg and one send, a drained interface one more recvmsg; select is the loop's.
+All that waits, at most 64 frames, is read with one system call (`recvmmsg`); a frame sent costs one more; select is the
+loop's. A base data frame can go from interface to interface as the record that came, without a Frame made of it.
 An interface that goes down is reported, what is sent meanwhile is lost and counted, and the socket lives on by itself;
 one that disappears is opened again with a back-off of 20 ms to 1 s.
+The kernel begins to stamp a moment after the first socket of the machine asked for it; until then it stamps what is
+read, so that the first frames of a machine may count as having come with the reading, never later than that.
 Leaves out: setting the bit rate and bringing interfaces up (`ip link`), filters in the kernel, hardware time stamps.
 """
 
@@ -16,10 +19,11 @@ import time
 from collections.abc import Callable
 from typing import Final, final
 
-from canopen_exo.bus.channel import Arrival, Channel, StampClock
+from canopen_exo.bus.channel import Arrival, RecordArrival, RecordChannel, StampClock
 from canopen_exo.bus.error_frame import ERROR_FLAG, read_error_frame
 from canopen_exo.bus.frame import FLAG_BRS, FLAG_ESI, FLAG_EXTENDED, FLAG_FD, FLAG_REMOTE, Frame
 from canopen_exo.bus.node import MS, NEVER, SECOND, ErrorState, PortState
+from canopen_exo.bus.recvmmsg import SO_RXQ_OVFL, SO_TIMESTAMPNS, Receiver
 from canopen_exo.errors import CanopenExoError
 
 CLASSICAL_SIZE: Final = 16
@@ -34,22 +38,22 @@ _FD_LENGTHS: Final = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
 
 _HEAD: Final = struct.Struct("=IBBBB")  # id and flags, length, FD flags, reserved, len8_dlc
 _HEAD_SIZE: Final = 8
+_CLASSICAL: Final = struct.Struct("=IBBBB8s")
+_FLEXIBLE: Final = struct.Struct("=IBBBB64s")
+_ID: Final = struct.Struct("=I")
+_LENGTH_AT: Final = 4
+_ID_LENGTH: Final = struct.Struct("=IB67x")
 
 # Not all of these are in Python's socket module; the values are those of asm-generic/socket.h (all but alpha, mips,
-# parisc and sparc) and linux/can/raw.h.
+# parisc and sparc), linux/sock_diag.h and linux/can/raw.h.
 _SO_RCVBUFFORCE: Final = 33
-_SO_TIMESTAMP: Final = 29
-_SO_TIMESTAMPNS: Final = 35
-_SO_RXQ_OVFL: Final = 40
+_SO_MEMINFO: Final = 55
+_MEMINFO: Final = struct.Struct("@9I")
+_MEMINFO_DROPS: Final = 8
 _SOL_CAN_RAW: Final = 101
 _CAN_RAW_ERR_FILTER: Final = 2
 _CAN_RAW_FD_FRAMES: Final = 5
 _CAN_ERR_MASK: Final = 0x1FFFFFFF
-
-_TIME: Final = struct.Struct("@ll")  # timespec or timeval
-_COUNT: Final = struct.Struct("@I")
-_ANCILLARY: Final = 64
-"""Bytes for control messages: stamp (16 + 16) and drop count (16 + 8)."""
 
 _RECEIVE_BUFFER: Final = 8 << 20
 """Bytes asked for; the kernel counts about 0.8 kB a frame: a second of a full bus, where it grants all of it."""
@@ -57,9 +61,6 @@ _RECEIVE_BUFFER: Final = 8 << 20
 _SEND_BUFFER: Final = 1
 """Asks for the kernel's minimum (4.6 kB, some six frames on their way): a full bus then shows as "not writable" before
 the interface's own queue is full (txqueuelen, 10 by default), for which select cannot wait."""
-
-_BATCH: Final = 256
-"""Frames read at a time; a flood must not keep the loop from its wake-ups."""
 
 _AGAIN_NS: Final = MS // 4
 """When an interface's queue was full (ENOBUFS): two frame times at 1 Mbit/s."""
@@ -74,19 +75,18 @@ def encode(frame: Frame) -> bytes:
     """The kernel's record of a frame: 16 bytes, or 72 for CAN FD."""
     flags = frame.flags
     data = frame.data
+    dlc = frame.dlc
     if flags == 0:
-        raw = frame.dlc
-        return _HEAD.pack(frame.can_id, len(data), 0, 0, raw if raw > 8 else 0) + data.ljust(8, b"\0")
+        return _CLASSICAL.pack(frame.can_id, len(data), 0, 0, dlc if dlc > 8 else 0, data)
     can_id = frame.can_id
     if flags & FLAG_EXTENDED:
         can_id |= _EXTENDED
     if flags & FLAG_FD:
         fd_flags = _FD_FDF | (_FD_BRS if flags & FLAG_BRS else 0) | (_FD_ESI if flags & FLAG_ESI else 0)
-        return _HEAD.pack(can_id, len(data), fd_flags, 0, 0) + data.ljust(64, b"\0")
-    dlc = frame.dlc
+        return _FLEXIBLE.pack(can_id, len(data), fd_flags, 0, 0, data)
     if flags & FLAG_REMOTE:
         can_id |= _REMOTE
-    return _HEAD.pack(can_id, dlc if dlc <= 8 else 8, 0, 0, dlc if dlc > 8 else 0) + data.ljust(8, b"\0")
+    return _CLASSICAL.pack(can_id, dlc if dlc <= 8 else 8, 0, 0, dlc if dlc > 8 else 0, data)
 
 
 def decode(record: bytes) -> Frame | None:
@@ -144,12 +144,9 @@ def prepare_socket(can: socket.socket) -> None:
     except OSError:
         can.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
     can.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
-    try:
-        can.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
-    except OSError:
-        can.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMP, 1)
-    with contextlib.suppress(OSError):  # without it overruns stay unseen
-        can.setsockopt(socket.SOL_SOCKET, _SO_RXQ_OVFL, 1)
+    can.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+    with contextlib.suppress(OSError):  # without it overruns show at the end only
+        can.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)
 
 
 def interface_error(name: str, interface: str, error: OSError) -> CanopenExoError:
@@ -173,7 +170,7 @@ def interface_error(name: str, interface: str, error: OSError) -> CanopenExoErro
 
 
 @final
-class SocketCanChannel(Channel):
+class SocketCanChannel(RecordChannel):
     """One SocketCAN interface. open_socket: gives a socket whose messages are the kernel's CAN records.
 
     The socket is opened at once; OSError passes to the caller then, later failures become notices.
@@ -183,6 +180,7 @@ class SocketCanChannel(Channel):
         super().__init__(name)
         self._open_socket: Final = open_socket
         self._stamps: Final = StampClock()
+        self._receiver: Final = Receiver()
         self._notices: list[PortState] = []
         self._state: PortState | None = None
         self._is_down: bool = False
@@ -191,41 +189,64 @@ class SocketCanChannel(Channel):
         self._back_off_ns: int = _FIRST_BACK_OFF_NS
         self._socket: socket.socket | None = open_socket()
         prepare_socket(self._socket)
+        self._receiver.attach(self._socket)
 
     def fileno(self) -> int:
         """The socket; -1 while the interface is away."""
         return -1 if self._socket is None else self._socket.fileno()
 
     def receive(self) -> list[Arrival]:
-        """What the kernel holds, at most 256 frames at once (the rest stays readable); opens again what was away."""
-        now = self._stamps.begin(self.epoch_ns)
+        """What the kernel holds, at most 64 frames at once (the rest stays readable); opens again what was away."""
         arrivals: list[Arrival] = []
+        for stamp, _, _, record, arrival in self.receive_records(0):
+            arrivals.append(Arrival(stamp, decode(record), None) if arrival is None else arrival)
+        return arrivals
+
+    def receive_records(self, place: int) -> list[RecordArrival]:
+        """As `receive`, undecoded."""
+        now = self._stamps.begin(self.epoch_ns)
+        found: list[RecordArrival] = []
         if self._socket is None and not self._is_closed:
             self._reopen(now)
-        can = self._socket
-        if can is not None:
+        if self._socket is not None:
             try:
-                for _ in range(_BATCH):
-                    record, ancillary, _, _ = can.recvmsg(FD_SIZE, _ANCILLARY)
-                    self._take(record, ancillary, now, arrivals)
+                count = self._receiver.read()
+                if self._receiver.is_plain and not self._is_down:
+                    if count == 1:  # what a bus that is not crowded gives; a frame waits for this
+                        record, seconds, nanos = self._receiver.first()
+                        self._take(record, self._stamps.at(seconds * SECOND + nanos), place, found)
+                    else:
+                        self._take_plain(place, now, found)
+                else:
+                    self._take_all(place, now, found)
             except BlockingIOError:
                 pass
             except OSError as error:
                 self._fail(error, now)
         if self._notices:
-            self._hand_out(now, arrivals)
+            self._hand_out(now, place, found)
         if self._socket is not None:
             self.poll_at = NEVER
-        return arrivals
+        return found
+
+    def frame_in(self, record: bytes) -> Frame:
+        """The frame in the record of a base data frame."""
+        frame = decode(record)
+        assert frame is not None
+        return frame
 
     def send(self, frame: Frame) -> bool:
         """Hand a frame to the kernel; False when its queue is full."""
+        return self.send_record(encode(frame))
+
+    def send_record(self, record: bytes) -> bool:
+        """As `send`, with the kernel's own record."""
         can = self._socket
         if can is None:
             self.lost += 1
             return True
         try:
-            can.send(encode(frame))
+            can.send(record)
         except BlockingIOError:
             self.send_at = 0
             return False
@@ -241,43 +262,84 @@ class SocketCanChannel(Channel):
             self._note(ErrorState.ERROR_ACTIVE, "interface up", time.monotonic_ns() - self.epoch_ns)
         return True
 
+    def count_overruns(self) -> None:
+        """Ask the kernel what it has dropped; with a frame it tells only what it dropped before that."""
+        if self._socket is None:
+            return
+        with contextlib.suppress(OSError):  # Linux before 4.12: what the frames told has to do
+            counts = self._socket.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, _MEMINFO.size)
+            if len(counts) == _MEMINFO.size:
+                self._count_drops(_MEMINFO.unpack(counts)[_MEMINFO_DROPS])
+
     def close(self) -> None:
         """Close the socket for good."""
         self._is_closed = True
         self.poll_at = NEVER
         if self._socket is not None:
+            self.count_overruns()
             self._socket.close()
             self._socket = None
 
-    def _take(self, record: bytes, ancillary: list[tuple[int, int, bytes]], now: int, arrivals: list[Arrival]) -> None:
-        """One message from the kernel."""
-        stamp = now
-        for _, kind, content in ancillary:
-            if kind == _SO_TIMESTAMPNS:
-                seconds, nanos = _TIME.unpack_from(content)
-                stamp = self._stamps.at(seconds * SECOND + nanos)
-            elif kind == _SO_TIMESTAMP:
-                seconds, micros = _TIME.unpack_from(content)
-                stamp = self._stamps.at(seconds * SECOND + micros * 1000)
-            elif kind == _SO_RXQ_OVFL:
-                drops = _COUNT.unpack_from(content)[0]
-                self.overruns += (drops - self._drops) & 0xFFFFFFFF
-                self._drops = drops
-        if self._is_down:
-            self._note(ErrorState.ERROR_ACTIVE, "interface up", now)
-            self._hand_out(stamp, arrivals)
+    def _take_plain(self, place: int, now: int, found: list[RecordArrival]) -> None:
+        """A batch of classical records with nothing else to tell: what nearly every batch is."""
+        receiver = self._receiver
+        clock = self._stamps
+        offset, last = clock.offset, clock.last
+        for (record,), (can_id, length), (seconds, nanos) in zip(
+            receiver.plain(), receiver.unpack(_ID_LENGTH), receiver.stamps(), strict=True
+        ):
+            stamp = seconds * SECOND + nanos - offset  # as StampClock.at
+            if stamp > now:
+                stamp = now
+            if stamp < last:
+                stamp = last
+            last = stamp
+            if can_id <= 0x7FF and length <= 8:
+                found.append((stamp, place, can_id, record, None))
+            else:
+                self._take(record, stamp, place, found)
+        clock.last = last
+
+    def _take_all(self, place: int, now: int, found: list[RecordArrival]) -> None:
+        """A batch of any kind."""
+        receiver = self._receiver
+        for realtime_ns, record in receiver.stamped():
+            stamp = now if realtime_ns < 0 else self._stamps.at(realtime_ns)
+            if self._is_down:
+                self._note(ErrorState.ERROR_ACTIVE, "interface up", now)
+                self._hand_out(stamp, place, found)
+            self._take(record, stamp, place, found)
+        if receiver.drops >= 0:
+            self._count_drops(receiver.drops)
+        if receiver.is_untold:
+            self.count_overruns()
+
+    def _take(self, record: bytes, stamp: int, place: int, found: list[RecordArrival]) -> None:
+        """One record of any kind."""
+        if len(record) == CLASSICAL_SIZE:
+            (can_id,) = _ID.unpack_from(record)
+            if can_id <= 0x7FF and record[_LENGTH_AT] <= 8:
+                found.append((stamp, place, can_id, record, None))
+                return
         frame = decode(record)
         if frame is not None:
-            arrivals.append(Arrival(stamp, frame, None))
+            found.append((stamp, place, -1, b"", Arrival(stamp, frame, None)))
             return
         if len(record) == CLASSICAL_SIZE:
             can_id = _HEAD.unpack_from(record)[0]
             if can_id & ERROR_FLAG:
                 self.errors += 1
                 self._state = read_error_frame(can_id, record[_HEAD_SIZE:], self._state)
-                arrivals.append(Arrival(stamp, None, self._state))
+                found.append((stamp, place, -1, b"", Arrival(stamp, None, self._state)))
                 return
         self.malformed += 1
+
+    def _count_drops(self, total: int) -> None:
+        """total: of this socket, modulo 2**32. A frame may tell an older total than the kernel did when asked."""
+        new = (total - self._drops) & 0xFFFFFFFF
+        if new < 1 << 31:
+            self.overruns += new
+            self._drops = total
 
     def _fail(self, error: OSError, now: int) -> None:
         """The socket reported `error`: down, gone, or a frame that this interface refuses (counted by the caller)."""
@@ -286,6 +348,7 @@ class SocketCanChannel(Channel):
         elif error.errno in _GONE:
             self._note(ErrorState.DOWN, "interface gone", now)
             if self._socket is not None:
+                self.count_overruns()
                 self._socket.close()
                 self._socket = None
             self._back_off_ns = _FIRST_BACK_OFF_NS
@@ -301,10 +364,10 @@ class SocketCanChannel(Channel):
         self._notices.append(self._state)
         self.poll_at = now
 
-    def _hand_out(self, stamp: int, arrivals: list[Arrival]) -> None:
+    def _hand_out(self, stamp: int, place: int, found: list[RecordArrival]) -> None:
         """The notices so far, as arrivals."""
         for state in self._notices:
-            arrivals.append(Arrival(stamp, None, state))
+            found.append((stamp, place, -1, b"", Arrival(stamp, None, state)))
         self._notices = []
 
     def _reopen(self, now: int) -> None:
@@ -318,3 +381,4 @@ class SocketCanChannel(Channel):
             return
         self._socket = can
         self._drops = 0
+        self._receiver.attach(can)

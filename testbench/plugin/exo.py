@@ -268,6 +268,8 @@ class Exo:
 
     def _limit(self, duration: str) -> int:
         """The instant that long from now, in the time of the started rig [ns]."""
+        if not isinstance(duration, str):  # a number of what? tests are not all type-checked
+            raise BenchError(f"duration {duration!r} given, allowed is text with a unit: '0.1 s', '15 cycles'")
         cycles = _CYCLES.fullmatch(duration)
         span = int(cycles[1]) * self.plan.cycle_ns if cycles else parse_duration(duration)
         if span < 0:

@@ -97,12 +97,15 @@ def exo(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator["Exo"]:
     """A rig at power-up, for this test alone: see docs/pytest.md."""
+    rig: Exo | None
     try:
         rig = _open(request)
     except ModuleNotFoundError as error:
         if error.name not in ("mujoco", "pyarrow", "matplotlib"):
             raise
-        pytest.fail(f"exo: {error.name} is missing: pip install 'exo-hil[sim]'", pytrace=False)
+        rig, missing = None, error.name
+    if rig is None:
+        pytest.fail(f"exo: {missing} is missing: pip install 'exo-hil[sim]'", pytrace=False)
     with rig:
         request.node.stash[_PLACES] = tmp_path_factory
         request.node.stash[_EXO] = rig
@@ -159,6 +162,11 @@ def _open(request: pytest.FixtureRequest) -> "Exo":
         buses = named_buses(bus)
         if buses is not None and getattr(config, "workerinput", {}).get("workercount", 1) > 1:
             raise BenchError(f"--exo-bus {bus}: one rig at a time fits on it; run without -n, or with -n 1")
+        if bus == HUB and without:
+            raise BenchError(
+                f"--exo-without {' '.join(sorted(without))}: nobody else knows where the hub of a test is; start "
+                "`exo-hil hub --timed` and name its buses: --exo-bus hub:controller,drive"
+            )
         if bus == LOCKSTEP:
             from testbench.plugin.lockstep import open_lockstep
 
@@ -167,7 +175,8 @@ def _open(request: pytest.FixtureRequest) -> "Exo":
 
         return RealTimeExo(scenario, bus, buses, without, goldens)
     except (BenchError, CanopenExoError, FaultError) as error:
-        pytest.fail(f"exo: {error}", pytrace=False)
+        wrong = str(error)
+    pytest.fail(f"exo: {wrong}", pytrace=False)  # out here, so that pytest does not show the same line as its cause
 
 
 def _scenario(item: pytest.Item, config: pytest.Config) -> "Scenario":

@@ -77,6 +77,10 @@ class GatewayControl:
             raise FaultError(f"no injector {name!r}; there are: {', '.join(specs) or 'none'}")
         return Injection(self, name)
 
+    def start(self) -> None:
+        """Time 0 is now, for a foreign controller that does not say it on the bus: from now on injectors act."""
+        self.command("start", "")
+
     def stop(self) -> None:
         """End all faults; every frame passes until `resume`."""
         self.command("stop", "")

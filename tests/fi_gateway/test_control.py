@@ -17,7 +17,16 @@ from canopen_exo.bus.node import MS, NEVER, SECOND, ErrorState, Out, PortState
 from canopen_exo.signal import Signal
 from fi_gateway import bus_control as wire
 from fi_gateway.bus_control import BusControl, Command, Status, read_command, read_status
-from fi_gateway.control import ControlRow, Direction, LiveControl, listing_text, perform, statistics, statistics_text
+from fi_gateway.control import (
+    ControlRow,
+    Direction,
+    LiveControl,
+    latency_text,
+    listing_text,
+    perform,
+    statistics,
+    statistics_text,
+)
 from fi_gateway.effects import ConstantTime, Effect, Infinite, Once
 from fi_gateway.errors import FaultError
 from fi_gateway.events import At, Event, Never
@@ -391,6 +400,17 @@ def test_statistics_count_what_faults_add() -> None:
     """Inserted frames are none that came in."""
     both = Direction("to_drives", 7, 1, 3, 0, 0, None)
     assert statistics_text([both]) == "to_drives: 7 frames, 1 lost by faults, 3 added"
+
+
+def test_histogram_of_the_added_latency_is_said_in_octaves() -> None:
+    """For people, at the gateway's end; a direction in which nothing was measured has none."""
+    to_drives = Lateness()
+    for delay_ns in (0, 900, 1023, 1024, 130_000, 131_071, 131_072):
+        to_drives.add(delay_ns)
+    drives, controller = statistics(live().gateway, [Lateness(), to_drives])
+    assert latency_text([drives, controller]) == (
+        "to_drives: frames by added latency: <= 0.001 us: 1, <= 1 us: 2, <= 2 us: 1, <= 0.13 ms: 2, <= 0.26 ms: 1"
+    )
 
 
 # ---- frames on the bus --------------------------------------------------------------------------------------------

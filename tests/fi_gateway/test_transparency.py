@@ -1,7 +1,8 @@
 """The gateway on real interfaces: real sockets with the kernel's CAN records on them, served by the real-time loop.
 
 The records are made here by hand from linux/can.h, byte for byte, and compared byte for byte: nothing of our codec is
-in the comparison. Socket pairs take the place of AF_CAN, which is tried out in tests/vcan.
+in the comparison. Socket pairs take the place of AF_CAN, which is tried out in tests/vcan. Every test runs on both ways
+through the loop: every frame made and handled (with a trace), and what only passes sent on as the record that came.
 """
 
 import errno
@@ -14,12 +15,13 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Final
 
 import pytest
 
+from canopen_exo.bus import recvmmsg
 from canopen_exo.bus.frame import Frame
 from canopen_exo.bus.hub import HubServer, listen
 from canopen_exo.bus.hub_client import HubChannel
@@ -75,22 +77,40 @@ def injector(name: str, cob_id: int, fault: Drop | BitFlip) -> Injector:
     )
 
 
+Pair = tuple[socket.socket, socket.socket]
+
+
+def unix_pair() -> Pair:
+    """Without the kernel's stamps."""
+    return socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+
+
+def udp_pair() -> Pair:
+    """With the kernel's stamps, as SocketCAN has them."""
+    ends = socket.socket(socket.AF_INET, socket.SOCK_DGRAM), socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    for end in ends:
+        end.bind(("127.0.0.1", 0))
+    for end, other in zip(ends, reversed(ends), strict=True):
+        end.connect(other.getsockname())
+    return ends
+
+
 class Bench:
     """A gateway between two interfaces, and the far ends of both. far[p]: what is connected to the gateway's port p."""
 
-    def __init__(self, injectors: list[Injector]) -> None:
+    def __init__(self, injectors: list[Injector], record: bool, pair: Callable[[], Pair]) -> None:
         self.gateway = Gateway(injectors, 2_000_000)
         self.far: list[socket.socket] = []
         self.channels: list[SocketCanChannel] = []
         self.came: list[list[bytes]] = [[], []]
         for name in ("controller", "drive"):
-            near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+            near, far = pair()
             far.setblocking(False)
             self.far.append(far)
             self.channels.append(SocketCanChannel(f"socketcan:{name}", near.dup))
             near.close()
         self.loop = RealTimeLoop(
-            self.gateway, list(self.channels), [0, 1], time.monotonic_ns(), record=True, measure_latency=True
+            self.gateway, list(self.channels), [0, 1], time.monotonic_ns(), record=record, measure_latency=True
         )
 
     def pass_all(self, given: list[list[bytes]], expected: list[int]) -> None:
@@ -128,16 +148,28 @@ class Bench:
             far.close()
 
 
-@contextmanager
-def bench(*injectors: Injector) -> Iterator[Bench]:
-    made = Bench(list(injectors))
-    try:
-        yield made
-    finally:
-        made.close()
+MakeBench = Callable[..., AbstractContextManager[Bench]]
+
+WAYS: Final = {"frames": (True, unix_pair), "records": (False, unix_pair), "stamped-records": (False, udp_pair)}
 
 
-def test_every_kind_of_frame_passes_both_ways_byte_for_byte() -> None:
+@pytest.fixture(params=WAYS)
+def bench(request: pytest.FixtureRequest) -> MakeBench:
+    """`bench(*injectors)`, as a context."""
+    record, pair = WAYS[request.param]
+
+    @contextmanager
+    def make(*injectors: Injector) -> Iterator[Bench]:
+        made = Bench(list(injectors), record, pair)
+        try:
+            yield made
+        finally:
+            made.close()
+
+    return make
+
+
+def test_every_kind_of_frame_passes_both_ways_byte_for_byte(bench: MakeBench) -> None:
     """Id type, DLC (raw ones too), RTR, FD, BRS and ESI kept; in order; nothing comes back to where it came from."""
     records = kinds()
     with bench() as made:
@@ -148,7 +180,7 @@ def test_every_kind_of_frame_passes_both_ways_byte_for_byte() -> None:
         assert made.loop.losses() == 0
 
 
-def test_armed_faults_elsewhere_change_nothing() -> None:
+def test_armed_faults_elsewhere_change_nothing(bench: MakeBench) -> None:
     """A fault acts on classical data frames of its target; every other kind with the same id passes."""
     records = [record for record in kinds() if struct.unpack_from("=I", record)[0] != 0x185 or len(record) == 72]
     target = [injector("drop", 0x185, Drop()), injector("flip", 0x123, BitFlip(None, 1))]
@@ -158,7 +190,7 @@ def test_armed_faults_elsewhere_change_nothing() -> None:
         assert made.came == [[classical(0x701, b"\0"), *records], []]
 
 
-def test_error_frames_are_counted_reported_and_not_forwarded() -> None:
+def test_error_frames_are_counted_reported_and_not_forwarded(bench: MakeBench) -> None:
     """design.md: SocketCAN error frames become PortState notices; bus-off to restart as linux/can/error.h has it."""
     passive = classical(ERROR | 0x204, bytes((0, 0x20, 0, 0, 0, 0, 130, 7)))
     bus_off = classical(ERROR | 0x40, bytes(8))
@@ -180,7 +212,7 @@ def test_error_frames_are_counted_reported_and_not_forwarded() -> None:
         assert made.channels[DRIVE_PORT].errors == 4
 
 
-def test_records_that_are_no_frames_are_counted_and_not_forwarded() -> None:
+def test_records_that_are_no_frames_are_counted_and_not_forwarded(bench: MakeBench) -> None:
     """Bad bytes are data: nothing raises, the frames around them pass."""
     good = [classical(0x100, b"\1"), classical(0x101, b"\2")]
     bad = [b"x", bytes(15), bytes(17), classical(0x100, bytes(8), length=9), bytes(71)]
@@ -190,7 +222,7 @@ def test_records_that_are_no_frames_are_counted_and_not_forwarded() -> None:
         assert made.channels[CONTROLLER_PORT].malformed == len(bad)
 
 
-def test_bus_off_on_one_side_loses_what_is_sent_there_and_ends_by_itself() -> None:
+def test_bus_off_on_one_side_loses_what_is_sent_there_and_ends_by_itself(bench: MakeBench) -> None:
     """Counted as undelivered, nothing old comes out afterwards; the other direction goes on."""
     away = [classical(0x200 + number, bytes((number,))) for number in range(5)]
     back = [classical(0x300, b"\7")]
@@ -204,7 +236,7 @@ def test_bus_off_on_one_side_loses_what_is_sent_there_and_ends_by_itself() -> No
         assert made.came == [[classical(0x181, b"\1")], back]
 
 
-def test_latency_is_measured_for_every_frame_sent() -> None:
+def test_latency_is_measured_for_every_frame_sent(bench: MakeBench) -> None:
     """From the stamp of the frame to its sending, by direction."""
     with bench() as made:
         made.pass_all([[classical(0x200, b"\1")] * 7, [classical(0x180, b"\1")] * 5], [5, 7])
@@ -215,8 +247,11 @@ def test_latency_is_measured_for_every_frame_sent() -> None:
         assert 0 <= to_drives.latency.percentile(0.5) <= to_drives.latency.worst_ns
 
 
-def test_an_interface_that_goes_away_and_comes_back_is_survived() -> None:
+def test_an_interface_that_goes_away_and_comes_back_is_survived(
+    bench: MakeBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """ENODEV: reported, opened again with back-off; the gateway resumes without being told."""
+    monkeypatch.setattr(recvmmsg, "find_recvmmsg", lambda: None)  # what a socket of our own can play is recvmsg
 
     class Gone(socket.socket):
         """A socket whose interface has been pulled out."""
@@ -253,7 +288,7 @@ def test_an_interface_that_goes_away_and_comes_back_is_survived() -> None:
         trigger.close()
 
 
-def test_no_frame_is_lost_doubled_or_moved_in_a_long_stream() -> None:
+def test_no_frame_is_lost_doubled_or_moved_in_a_long_stream(bench: MakeBench) -> None:
     """None without a fault asking for it: 20 000 random frames, both ways; `make soak` takes 10 million."""
     chance = random.Random(11)
     pool = kinds()

@@ -5,12 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from canopen_exo.bus.frame import Frame
 from canopen_exo.bus.lateness import Lateness
 from canopen_exo.bus.medium import Transmission
 from canopen_exo.bus.node import MS, NEVER
+from canopen_exo.plan import RPDO1
 from fi_gateway.injector import Injector
 from fi_gateway.schema import build_injectors
-from testbench.merge import IncompleteError, merge
+from testbench.merge import GIVEN_UP, IncompleteError, add_reasons, merge
 from testbench.parts import ControlNote, GatewayPart, HlcPart, JointsPart, NotedEvent, Service
 from testbench.record import RunRecord
 from testbench.rig import CONTROLLER_BUS, DRIVE_BUS, Rig, build_rig
@@ -358,6 +360,100 @@ def test_commands_of_a_foreign_controller_come_from_its_frames(
     wanted = np.clip(expected.commands.tau_command, -1000 * rated, 1000 * rated)  # the clamp is at rated torque
     assert np.all(np.abs(found.commands.tau_command - wanted) <= rated)  # per mille of rated torque on the wire
     assert np.array_equal(found.truth.q, expected.truth.q)
+
+
+def test_foreign_controller_that_walks_to_the_end_has_completed(
+    scenario: Scenario, expected: RunRecord, parts: Parts
+) -> None:
+    """Commands to the end, drives enabled to the end."""
+    _, gateway, joints = parts
+    assert merge(scenario.plan, expected.duration_ns, None, gateway, joints, []).completed
+
+
+@pytest.mark.parametrize(("silent_ms", "completed"), [(90, True), (200, False), (990, False)])
+def test_foreign_controller_that_falls_silent_has_given_up(
+    scenario: Scenario, expected: RunRecord, parts: Parts, silent_ms: int, completed: bool
+) -> None:
+    """A master that crashed proves nothing in a golden run, also where the drives do not notice."""
+    _, gateway, joints = parts
+    end = expected.time0_ns + expected.duration_ns
+    rows = [row for row in gateway.rows if row.frame.can_id & 0x780 != RPDO1 or row.end_ns < end - silent_ms * MS]
+    found = merge(scenario.plan, expected.duration_ns, None, replace(gateway, rows=rows), joints, [])
+    assert found.completed == completed
+    add_reasons(found, [], golden=True)
+    if completed:
+        assert found.invalid_reasons == []
+    else:
+        (reason,) = found.invalid_reasons
+        assert reason.startswith("the motion was given up without a fault: HLC at ")
+        assert reason.endswith(" s: no command for more than 10 cycles after this one")
+
+
+def test_gap_in_a_foreign_controllers_commands_counts_as_its_end(
+    scenario: Scenario, expected: RunRecord, parts: Parts
+) -> None:
+    """At the time of the last command before it."""
+    _, gateway, joints = parts
+    gap = range(expected.time0_ns + 300 * MS, expected.time0_ns + 450 * MS)
+    rows = [row for row in gateway.rows if row.frame.can_id & 0x780 != RPDO1 or row.end_ns not in gap]
+    found = merge(scenario.plan, expected.duration_ns, None, replace(gateway, rows=rows), joints, [])
+    (end,) = [note for note in found.notes if note.kind == GIVEN_UP]
+    assert (found.completed, end.node) == (False, "HLC")
+    assert 0.29 <= end.time_s <= 0.3
+
+
+@pytest.mark.parametrize("word", [0x0650, 0x0618])
+def test_drive_that_leaves_operation_enabled_ends_a_foreign_controllers_motion(
+    scenario: Scenario, expected: RunRecord, parts: Parts, word: int
+) -> None:
+    """The drive is named with its new state; after the motion it may do so."""
+    _, gateway, joints = parts
+
+    def merged(from_ns: int) -> RunRecord:
+        rows = [
+            Transmission(row.end_ns, row.bus, Frame(0x285, word.to_bytes(2, "little") + row.frame.data[2:]), -1)
+            if row.frame.can_id == 0x285 and row.bus == 1 and row.end_ns >= from_ns
+            else row
+            for row in gateway.rows
+        ]
+        return merge(scenario.plan, expected.duration_ns, None, replace(gateway, rows=rows), joints, [])
+
+    found = merged(expected.time0_ns + 500 * MS)
+    (end,) = [note for note in found.notes if note.kind == GIVEN_UP]
+    assert (found.completed, end.node) == (False, "right_knee")
+    assert end.text == f"left Operation enabled, now {'switch on disabled' if word == 0x0650 else 'fault'}"
+    assert 0.5 <= end.time_s <= 0.6  # TPDO2 comes with every 10th SYNC
+    assert merged(expected.time0_ns + expected.duration_ns + 1).completed
+    assert merged(0).completed  # it was never enabled: not part of this motion
+
+
+def shifted(rows: list[Transmission], by_ns: int) -> list[Transmission]:
+    return [Transmission(row.end_ns + by_ns, row.bus, row.frame, row.sender) for row in rows]
+
+
+@pytest.mark.parametrize("phase_ms", range(0, 10, 3))
+def test_foreign_controller_is_on_time_by_its_own_clock(scenario: Scenario, parts: Parts, phase_ms: int) -> None:
+    """Where its SYNC lies on the grid from time 0 (which somebody may have said by hand) makes nothing late."""
+    hlc, gateway, joints = parts
+    timing = judge_timing(
+        scenario.plan,
+        hlc.time_zero,
+        hlc.cycles.size,
+        None,
+        replace(gateway, rows=shifted(gateway.rows, phase_ms * MS)),
+        replace(joints, rows=shifted(joints.rows, phase_ms * MS)),
+    )
+    assert (timing.late, timing.lost) == ({}, [])
+
+
+def test_our_part_of_a_foreign_frames_way_may_take_one_cycle(scenario: Scenario, parts: Parts) -> None:
+    """The joints stand still for 35 ms: the cycles of what they got late are late, by what is beyond one cycle."""
+    hlc, gateway, joints = parts
+    start = hlc.time_zero + 400 * MS
+    late = delayed(joints.rows, start, start + 10 * MS, 35 * MS, None)
+    timing = judge_timing(scenario.plan, hlc.time_zero, hlc.cycles.size, None, gateway, replace(joints, rows=late))
+    assert timing.late
+    assert 25 * MS < timing.late_worst_ns < 36 * MS
 
 
 def test_without_gateway_the_supervisors_ears_count(scenario: Scenario, expected: RunRecord, parts: Parts) -> None:

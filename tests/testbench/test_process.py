@@ -3,7 +3,9 @@
 Real processes against the clock are in test_supervisor.py and test_realtime.py.
 """
 
+import os
 import signal
+import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -21,6 +23,7 @@ from fi_gateway.gateway import CONTROLLER_PORT, DRIVE_PORT
 from testbench import cli_rig, process, supervisor
 from testbench.cli import main
 from testbench.errors import BenchError
+from testbench.fault_file import faults_of
 from testbench.gateway_process import ControlFrames, GatewayOptions, control_frames, gateway_main
 from testbench.parts import read_gateway, read_hlc, read_joints
 from testbench.process import Orders, ProcessOptions, die_with, hlc_main, joints_main, session
@@ -140,10 +143,49 @@ def test_gateway_first_stops_injecting_and_ends_with_the_second_interrupt(
     next(signalled).extend([signal.SIGINT, signal.SIGINT])
     part = tmp_path / "gateway.npz"
     options = ProcessOptions(part=part)
-    assert gateway_main(scenario, ("hub:controller", "hub:drive"), options, GatewayOptions()) == 0
+    assert gateway_main(faults_of(scenario), ("hub:controller", "hub:drive"), options, GatewayOptions()) == 0
     (row,) = read_gateway(part).controls
     assert (row.what, row.name, row.source, row.refused) == ("stop", "", "signal", "")
     assert [channel.name for channel in channels] == ["hub:controller", "hub:drive"]
+
+
+@pytest.mark.parametrize("address", ["127.0.0.1:TAKEN", "/no/such/folder/control"])
+def test_gateway_that_cannot_listen_is_told_in_one_line(
+    channels: list[DeadChannel], address: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Exit 2: a second rig at the default address, a folder that is not there; no defect of the program."""
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        address = address.replace("TAKEN", str(taken.getsockname()[1]))
+        assert main(["gateway", "--control", address]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"live control: cannot listen at {address}: ")
+    assert len(said.strip().splitlines()) == 1
+    assert [channel.closed for channel in channels] == [True, True]
+
+
+FAULTS = """\
+injectors:
+  silence:
+    target: {bus: to_controller, cob_id: 0x185}
+    fault: {type: drop}
+    event: {type: at, time: 1 s}
+    effect: {type: infinite}
+"""
+
+
+def test_gateway_needs_no_more_than_injectors_and_says_what_it_does(
+    channels: list[DeadChannel], signalled: Iterator[list[int]], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """On real buses nothing is simulated: no motion, no plant; what it stands between, and at its end what passed."""
+    next(signalled).extend([signal.SIGINT, signal.SIGINT])
+    (tmp_path / "faults.yaml").write_text(FAULTS)
+    assert main(["gateway", str(tmp_path / "faults.yaml"), "--controller-bus", "hub:a", "--drive-bus", "hub:b"]) == 0
+    assert capfd.readouterr().err.splitlines() == [
+        "gateway: between hub:a (controller) and hub:b (drives); injectors: silence",
+        "gateway: injection is stopped, frames pass on; nothing resumes it without --control, Ctrl-C ends",
+        "gateway: to_drives: 0 frames, 0 lost by faults",
+        "gateway: to_controller: 0 frames, 0 lost by faults",
+    ]
 
 
 def test_signal_handlers_of_the_caller_are_put_back() -> None:
@@ -154,6 +196,23 @@ def test_signal_handlers_of_the_caller_are_put_back() -> None:
         signal.raise_signal(signal.SIGINT)
         assert (orders.terminations, orders.interrupts, orders.count) == (1, 1, 2)
     assert signal.getsignal(signal.SIGTERM) is before
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="has no such signal")
+@pytest.mark.parametrize(("number", "stays"), [(signal.SIGTERM, True), (signal.SIGHUP, False)])
+def test_folder_of_the_rig_goes_when_the_supervisor_is_gone_and_not_when_it_tells_to_end(
+    channels: list[DeadChannel], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals, stays: bool
+) -> None:
+    """The kernel tells with SIGHUP, a supervisor with SIGTERM; it still needs the parts that are in there."""
+    monkeypatch.setattr(process, "die_with", lambda supervisor: None)
+    folder = tmp_path / "rig"
+    folder.mkdir()
+    (folder / "scenario.yaml").touch()
+    options = ProcessOptions(supervisor=os.getppid(), folder=folder)  # which is there, as far as anyone can see
+    with session("joints", Node(), ["hub:drive"], [0], options) as served:
+        signal.raise_signal(number)
+        served.run(lambda now: served.orders.count > 0)
+    assert folder.exists() == stays
 
 
 def test_process_whose_supervisor_is_gone_does_not_start(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -192,6 +251,10 @@ def test_nodes_begin_on_the_next_whole_millisecond(channels: list[DeadChannel]) 
         (["up", "--controller-bus", "hub:a", "--drive-bus", "hub:a"], "round for ever"),
         (["gateway", "--controller-bus", "hub:a", "--drive-bus", "hub:a"], "round for ever"),
         (["gateway", "--control-frames", "middle"], "controller or drive"),
+        (["gateway", "--control-frames", "drive:1,0x900"], "allowed 0x1..0x7ff"),
+        (["gateway", "missing.yaml"], "missing.yaml"),
+        (["fault", "trigger"], "which injector?"),
+        (["fault", "list", "x"], "'x' given, allowed is nothing"),
         (["joints", "--bus", "nonsense"], "INTERFACE:CHANNEL"),
         (["hlc", "--bus", "hub:127.0.0.1:1/x"], "exo-hil hub"),
         (["joints", "--set", "rig.rate=3 Hz"], "allowed: 500, 250"),

@@ -11,6 +11,7 @@ import pytest
 
 import testbench.plugin.lockstep  # noqa: F401 (an inner run must not be the first to load MuJoCo: it unloads its modules)
 from testbench.plugin.hooks import named_buses
+from tests.parity.patience import Late, Patience, told_late
 
 pytest_plugins = ["pytester"]
 
@@ -144,6 +145,36 @@ def test_a_wrong_marker_fails_its_test_in_one_line(pytester: pytest.Pytester, ma
     result.assert_outcomes(passed=1, errors=1)
     result.stdout.fnmatch_lines([f"exo: {words}".replace("[", "[[]")])
     result.stdout.no_fnmatch_line("*hooks.py*")
+    result.stdout.no_fnmatch_line("*During handling*")
+
+
+@pytest.mark.parametrize(
+    ("options", "words"), [(["--exo-bus=hub"], "start `exo-hil hub --timed`*"), ([], "name a bus*")]
+)
+def test_a_foreign_part_needs_buses_that_others_can_find(
+    pytester: pytest.Pytester, options: list[str], words: str
+) -> None:
+    """Neither virtual time nor the hub of one test can be reached; what can is said."""
+    pytester.makepyfile("def test_rig(exo): pass")
+    result = run(pytester, "--exo-without=hlc", *options)
+    result.assert_outcomes(errors=1)
+    result.stdout.fnmatch_lines([f"exo: --exo-without hlc: *{words}"])
+
+
+def test_a_duration_without_a_unit_is_refused_with_the_form_that_is_allowed(pytester: pytest.Pytester) -> None:
+    """As in a scenario file: 0.1 of what?"""
+    pytester.makepyfile("def test_rig(exo): exo.run_for(0.1)")
+    result = run(pytester)
+    result.assert_outcomes(failed=1)
+    result.stdout.fnmatch_lines(["E*duration 0.1 given, allowed is text with a unit: '0.1 s', '15 cycles'"])
+
+
+def test_time_0_that_the_controller_has_said_cannot_be_said_again(pytester: pytest.Pytester) -> None:
+    """`exo.gateway.start()` is for foreign controllers."""
+    pytester.makepyfile("def test_rig(exo):\n    exo.run_until_motion()\n    exo.gateway.start()")
+    result = run(pytester)
+    result.assert_outcomes(failed=1)
+    result.stdout.fnmatch_lines(["E*FaultError: start: time 0 is known already*"])
 
 
 @pytest.mark.parametrize(
@@ -400,19 +431,19 @@ def test_real(exo):
 
 
 @pytest.mark.realtime
-def test_the_same_words_drive_a_rig_on_the_hub(pytester: pytest.Pytester) -> None:
+def test_the_same_words_drive_a_rig_on_the_hub(pytester: pytest.Pytester, patience: Patience) -> None:
     """Injection, expectation, sending, golden comparison on processes; a busy machine skips, it does not fail."""
     pytester.makepyfile(REAL)
-    said: list[str] = []
-    for _ in range(3):
+
+    def attempt() -> Late | None:
         result = run_apart(pytester, "--exo-bus=hub", FAST)
         if result.ret == pytest.ExitCode.OK:
-            return
-        found = [line for line in result.outlines if line.startswith("timing: ")]
-        is_late = any(not line.startswith("timing: 0 of ") for line in found)
-        assert is_late or "not ready after" in result.stdout.str(), result.stdout.str()
-        said += found
-    pytest.skip("the machine is too busy: " + "; ".join(said))
+            return None
+        late = told_late(result.stdout.str(), 10.0)
+        assert late, result.stdout.str()
+        return Late("; ".join(late))
+
+    patience.until_punctual(attempt)
 
 
 @pytest.mark.realtime

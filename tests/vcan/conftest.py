@@ -82,6 +82,8 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
     """The report from inside, unless there is something to report about this side."""
     if call.excinfo is not None or not is_borrowed(item):
         return None
+    if "inner_run" not in getattr(item, "funcargs", {}):  # there was none: the teardown of a skipped test
+        return None
     return inner_run_of(item).reports.get((item.nodeid, call.when))
 
 

@@ -9,6 +9,7 @@ Sources: rtnetlink(7), unshare(2), finit_module(2), reboot(2); the kernel's Docu
 
 import contextlib
 import ctypes
+import functools
 import json
 import os
 import shutil
@@ -18,6 +19,7 @@ import struct
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple, NoReturn
@@ -33,6 +35,7 @@ MODULES = ("net/can/can", "drivers/net/can/dev/can-dev", "net/can/can-raw", "net
            "drivers/net/can/vcan", "drivers/net/can/vxcan", "net/sched/sch_tbf")
 MOUNTS = (("proc", "/proc"), ("sysfs", "/sys"), ("tmpfs", "/run"), ("tmpfs", "/dev/shm"), ("devpts", "/dev/pts"))
 HIDDEN = ("/proc", "/sys", "/run", "/dev")  # what the host has there cannot be seen inside UML
+FETCH_LIMIT_S = 120.0  # for all that comes from a package source; some 20 MB
 BOOT_LIMIT_S = 60.0  # start and halt take 0.5 s on an idle machine; the rest is for a crowded one
 
 CLONE_NEWUSER, CLONE_NEWNET, POWER_OFF, SYS_FINIT_MODULE = 0x10000000, 0x40000000, 0x4321FEDC, 313  # 313: x86-64
@@ -59,10 +62,26 @@ class Job(NamedTuple):
 
 
 def fetch(cache: Path) -> Path:
-    """Unpack (not install) `PACKAGES` into `cache`/root, once, and return that; several may ask at once."""
+    """Unpack (not install) `PACKAGES` into `cache`/root, once, and return that; several may ask at once.
+
+    What could not be fetched is not tried again by this process.
+    """
+    root = cache.resolve() / "root"
+    reason = _fetch(root)
+    if reason:
+        raise VcanError("User Mode Linux cannot be fetched; use a kernel that has vcan, or make a Debian package "
+                        f"source reachable, or unpack the .deb files of {' and '.join(PACKAGES)} with dpkg -x into "
+                        f"{root}: {reason}")
+    if not (root / KERNEL).exists() or not list(root.glob(MODULES_AT)):
+        raise VcanError(f"{root}: {KERNEL} or {MODULES_AT} is missing; delete the folder and try again")
+    return root
+
+
+@functools.cache
+def _fetch(root: Path) -> str:
+    """Make `root` unless it is there; why it cannot be made, "" when it is there."""
     import fcntl  # here, because this module is imported where there is none, too
 
-    root = cache.resolve() / "root"
     root.parent.mkdir(parents=True, exist_ok=True)
     with (root.parent / "lock").open("w") as lock, tempfile.TemporaryDirectory(dir=root.parent) as work:
         fcntl.flock(lock, fcntl.LOCK_EX)
@@ -70,35 +89,35 @@ def fetch(cache: Path) -> Path:
             try:
                 _download(Path(work))
                 for deb in Path(work).glob("*.deb"):
-                    _tool(["dpkg", "-x", str(deb), f"{work}/root"], work)
+                    _tool(["dpkg", "-x", str(deb), f"{work}/root"], work, FETCH_LIMIT_S)
             except VcanError as error:
-                raise VcanError(f"User Mode Linux cannot be fetched: {error}; make a Debian package source reachable, "
-                                f"or unpack the .deb files of {' and '.join(PACKAGES)} with dpkg -x into {root}, "
-                                "or use a kernel that has vcan") from error
+                return str(error)
             os.replace(f"{work}/root", root)
-    if not (root / KERNEL).exists() or not list(root.glob(MODULES_AT)):
-        raise VcanError(f"{root}: {KERNEL} or {MODULES_AT} is missing; delete the folder and try again")
-    return root
+    return ""
 
 
 def _download(folder: Path) -> None:
     """`apt-get download`; where the machine's package lists are missing or stale, again with fresh ones of our own."""
-    get = ["apt-get", "-q", "-o", "APT::Sandbox::User=root"]
+    limit = time.monotonic() + FETCH_LIMIT_S
+    get = ["apt-get", "-q", "-o", "APT::Sandbox::User=root", "-o", "Acquire::Retries=1"]
+    for scheme in ("http", "https"):
+        get += ["-o", f"Acquire::{scheme}::Timeout=20"]
     try:
-        _tool([*get, "download", *PACKAGES], folder)
+        _tool([*get, "download", *PACKAGES], folder, FETCH_LIMIT_S)
     except VcanError:
         get += ["-o", f"Dir::State::Lists={folder}/lists", "-o", f"Dir::Cache={folder}/apt"]
         (folder / "lists/partial").mkdir(parents=True)
         (folder / "apt/archives/partial").mkdir(parents=True)
-        _tool([*get, "update"], folder)
-        _tool([*get, "download", *PACKAGES], folder)
+        for words in (["update"], ["download", *PACKAGES]):
+            _tool([*get, *words], folder, max(limit - time.monotonic(), 1.0))
 
 
-def _tool(command: list[str], cwd: Path | str) -> None:
+def _tool(command: list[str], cwd: Path | str, limit_s: float) -> None:
     try:
-        subprocess.run(command, cwd=cwd, input="", capture_output=True, text=True, check=True, timeout=600)
+        subprocess.run(command, cwd=cwd, input="", capture_output=True, text=True, check=True, timeout=limit_s)
     except (OSError, subprocess.SubprocessError) as error:
-        raise VcanError(f"{error} {getattr(error, 'stderr', '')}".rstrip()) from error
+        told = " ".join(str(getattr(error, "stderr", None) or error).split())
+        raise VcanError(f"{command[0]}: {told}") from error
 
 
 def native_vcan_available() -> bool:

@@ -1,5 +1,6 @@
 """Any python-can bus as a channel: on python-can's own virtual bus, and on one that fails as told."""
 
+import errno
 import os
 import time
 from collections.abc import Iterator
@@ -287,6 +288,32 @@ def test_frame_the_interface_cannot_send_is_lost_at_once() -> None:
     bus.fails = [ValueError("no FD")]
     assert channel.send(KINDS[0])
     assert channel.lost == 1
+
+
+@pytest.mark.parametrize(
+    ("protocol", "error", "is_lost"),
+    [
+        (can.CanProtocol.CAN_20, can.CanOperationError("Failed to transmit"), True),
+        (can.CanProtocol.CAN_20, OSError(errno.ENOBUFS, "No buffer space available"), True),
+        (can.CanProtocol.CAN_FD, can.CanOperationError("Failed to transmit", errno.EINVAL), True),
+        (can.CanProtocol.CAN_FD, OSError(errno.EINVAL, "Invalid argument"), True),
+        (can.CanProtocol.CAN_FD, can.CanOperationError("Transmit buffer full"), False),
+        (can.CanProtocol.CAN_FD, OSError(errno.ENOBUFS, "No buffer space available"), False),
+    ],
+)
+def test_fd_frame_its_bus_cannot_carry_is_lost_at_once(
+    protocol: can.CanProtocol, error: Exception, is_lost: bool
+) -> None:
+    """Nothing behind it waits, and the interface does not count as down; a full queue is another matter."""
+    bus = ScriptedBus()
+    bus._can_protocol = protocol
+    channel = opened(bus)
+    bus.fails = [error]
+    assert channel.send(Frame(0x123, bytes(64), FLAG_FD)) is is_lost
+    assert channel.lost == int(is_lost)
+    assert channel.receive() == []
+    bus.fails = [error]
+    assert not channel.send(Frame(0x123, bytes(8)))  # a classical frame may go later
 
 
 def test_bus_that_fails_to_read_is_opened_again_with_back_off() -> None:

@@ -15,10 +15,14 @@ from typing import Protocol
 import can
 import canopen
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from canopen_exo.bus import hub_plugin
 from canopen_exo.bus.hub import HubServer
 from canopen_exo.bus.hub_client import HubChannel
 from canopen_exo.bus.hub_plugin import HubBus
+from canopen_exo.bus.hub_wire import pack_record
 from canopen_exo.bus.medium import QUEUE_LENGTH
 from canopen_exo.bus.node import SECOND
 from canopen_exo.bus.realtime import RealTimeLoop
@@ -93,6 +97,40 @@ def test_every_kind_of_message_passes_unchanged(start_hub: StartHub, sent: can.M
         assert received.channel == second.channel
         # 1 s: the wall clock may be corrected between the welcome, which ties both clocks together, and now
         assert before - 1 <= received.timestamp <= time.time() + 1
+
+
+@given(
+    st.integers(0, 0x900), st.binary(max_size=9), st.integers(0, 15), st.sampled_from(("", "extended", "remote", "fd"))
+)
+def test_short_way_for_plain_messages_is_the_long_way(can_id: int, data: bytes, dlc: int, kind: str) -> None:
+    """Base data frames are packed and unpacked apart; the bytes and the message are those of the way for all kinds."""
+    sent = can.Message(
+        arbitration_id=can_id,
+        is_extended_id=kind == "extended",
+        is_remote_frame=kind == "remote",
+        is_fd=kind == "fd",
+        data=None if kind == "remote" else data,
+        dlc=dlc if kind == "remote" else None,
+    )
+    short = hub_plugin._pack_plain(sent)
+    is_plain = kind == "" and can_id <= 0x7FF and len(data) <= 8
+    assert bool(short) == is_plain
+    record = short or pack_record(can_id & 0x7FF, 0, min(dlc, 8), data[: min(dlc, 8)], 5)
+    if is_plain:
+        assert short == hub_plugin._pack(sent)
+    received = hub_plugin._unpack_plain(record, 0, 7, "here")
+    assert (received is None) == (record[2] != record[3])
+    if received is not None:
+        long_way = hub_plugin._unpack(record, 0, 7, "here")
+        assert received.equals(long_way, timestamp_delta=0)
+
+
+def test_plain_record_with_rubbish_behind_its_data_is_none() -> None:
+    """It is looked at more closely, and refused."""
+    record = bytearray(pack_record(0x181, 0, 4, b"1234"))
+    assert hub_plugin._unpack_plain(bytes(record), 0, 0, "here") is not None
+    record[23] = 1
+    assert hub_plugin._unpack_plain(bytes(record), 0, 0, "here") is None
 
 
 @pytest.mark.parametrize("bitrate", [0, 1_000_000])

@@ -98,3 +98,9 @@ def test_document_without_bins_is_refused() -> None:
     """As above, for a missing key."""
     with pytest.raises(CanopenExoError, match="no distribution"):
         Lateness.from_document({"count": 0, "worst_ns": 0})  # type: ignore[typeddict-item]
+
+
+def test_words_are_in_milliseconds() -> None:
+    """For the message of a run that was late."""
+    lateness = filled([1_000_000] * 99 + [50_000_000])
+    assert lateness.words() == "100, 50 % within 1.0 ms, 90 % within 1.0 ms, 99 % within 1.0 ms, the latest 50.0 ms"

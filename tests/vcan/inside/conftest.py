@@ -10,7 +10,8 @@ import pytest
 from canopen_exo.bus.channel import Channel
 from canopen_exo.bus.interfaces import open_channel, parse_bus
 from tests.vcan import uml
-from tests.vcan.inside.peers import Candump, python_can
+from tests.vcan.inside.peers import Candump, python_can, wait_until
+from tests.vcan.inside.programs import our_processes
 
 
 @pytest.fixture
@@ -71,6 +72,13 @@ def spare() -> Iterator[str]:
     yield name
     if Path(f"/sys/class/net/{name}").exists():
         uml.delete_link(name)
+
+
+@pytest.fixture
+def nothing_left() -> Iterator[None]:
+    """No process of ours outlives its test."""
+    yield
+    wait_until(lambda: our_processes() == [], f"all processes have ended: {our_processes()}")
 
 
 @pytest.fixture(autouse=True)

@@ -17,6 +17,7 @@ from canopen_exo.bus.node import MS, SECOND, ErrorState, Node, Out
 from canopen_exo.bus.realtime import RealTimeLoop
 from canopen_exo.bus.socketcan import encode
 from canopen_exo.errors import CanopenExoError
+from tests.stamps import kernel_stamps
 from tests.vcan import uml
 from tests.vcan.inside.peers import (
     BUS_OFF,
@@ -100,14 +101,14 @@ def test_order_is_kept_and_nothing_is_lost(either: Channel, peer: can.BusABC) ->
 
 def test_stamp_is_of_arrival_and_not_of_reading(either: Channel, peer: can.BusABC) -> None:
     """Kernel time stamps: frames read together keep the distance at which they came."""
-    select.select([], [], [], 0.05)  # the kernel begins to stamp a moment after it was first asked to
-    before = time.monotonic_ns() - either.epoch_ns
-    peer.send(KINDS[1].of_python_can())
-    select.select([], [], [], 0.05)
-    peer.send(KINDS[2].of_python_can())
-    after = time.monotonic_ns() - either.epoch_ns
-    select.select([], [], [], 0.05)
-    first, second = receive(either, 2)
+    with kernel_stamps():
+        before = time.monotonic_ns() - either.epoch_ns
+        peer.send(KINDS[1].of_python_can())
+        select.select([], [], [], 0.05)
+        peer.send(KINDS[2].of_python_can())
+        after = time.monotonic_ns() - either.epoch_ns
+        select.select([], [], [], 0.05)
+        first, second = receive(either, 2)
     # Both clocks run at the same rate to 500 ppm (adjtimex); 1 ms for the resolution of a wall clock set meanwhile.
     assert second.stamp_ns - first.stamp_ns >= 49 * MS
     # The offset of the clocks is read in two calls, between which this process may be interrupted for a while.

@@ -1,0 +1,267 @@
+"""Many records with one system call: recvmmsg(2), which Python's socket module does not have.
+
+Source: recvmmsg(2), recvmsg(2), cmsg(3); socket(7) for SO_TIMESTAMPNS and SO_RXQ_OVFL. ctypes lays the structures out
+for the machine at hand. Where the C library or the kernel has no recvmmsg, recvmsg gives the same, one record a call.
+Leaves out: the senders' addresses, and what a datagram has beyond the 72 bytes of the longest CAN record.
+"""
+
+import ctypes
+import errno
+import os
+import socket
+import struct
+import sys
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Final, final
+
+SLOTS: Final = 64
+"""Records read at a time: the cost of a call is shared by them, and a flood does not keep a loop from its wake-ups."""
+
+RECORD_SIZE: Final = 72
+"""linux/can.h: struct canfd_frame, the longest record."""
+
+SO_TIMESTAMPNS: Final = 35  # asm-generic/socket.h, as on all but alpha, mips, parisc and sparc
+SO_RXQ_OVFL: Final = 40
+
+_PLAIN_SIZE: Final = 16
+"""linux/can.h: struct can_frame."""
+
+_CONTROL_SIZE: Final = 64
+"""Bytes for control messages: a stamp (16 + 16) and a drop count (16 + 8), which comes only after a drop."""
+
+_CONTROL_HEAD: Final = struct.Struct("@Nii")  # struct cmsghdr: length with this head, level, type
+_ALIGNED: Final = struct.calcsize("N")
+_TIME: Final = struct.Struct("@ll")  # timespec
+_COUNT: Final = struct.Struct("@I")
+_STAMP_SIZE: Final = _CONTROL_HEAD.size + _TIME.size
+_STAMP_AT: Final = _CONTROL_HEAD.size
+_FIRST_STAMP: Final = _TIME.unpack_from
+_STAMPS: Final = struct.Struct(f"@{_CONTROL_HEAD.size}xll{_CONTROL_SIZE - _STAMP_SIZE}x")
+_RECORDS: Final = struct.Struct(f"{_PLAIN_SIZE}s{RECORD_SIZE - _PLAIN_SIZE}x")
+_SECOND: Final = 1_000_000_000
+
+_MISSING: Final = (errno.ENOSYS, errno.EPERM)
+"""A kernel without the call, or a sandbox that refuses it."""
+
+Stamped = tuple[int, bytes]
+"""The kernel's stamp [ns] on CLOCK_REALTIME, -1 without one; the record."""
+
+
+class _Vector(ctypes.Structure):
+    """struct iovec."""
+
+    _fields_ = (("base", ctypes.c_void_p), ("size", ctypes.c_size_t))
+
+
+class _Message(ctypes.Structure):
+    """struct msghdr."""
+
+    _fields_ = (
+        ("name", ctypes.c_void_p),
+        ("name_size", ctypes.c_uint),
+        ("vectors", ctypes.c_void_p),
+        ("vector_count", ctypes.c_size_t),
+        ("control", ctypes.c_void_p),
+        ("control_size", ctypes.c_size_t),
+        ("flags", ctypes.c_int),
+    )
+
+
+class _Slot(ctypes.Structure):
+    """struct mmsghdr."""
+
+    _fields_ = (("message", _Message), ("size", ctypes.c_uint))
+
+
+_SLOT_SIZE: Final = ctypes.sizeof(_Slot)
+
+
+@final
+class Receiver:
+    """Reads from sockets that stamp what comes (SO_TIMESTAMPNS) and count what they drop (SO_RXQ_OVFL).
+
+    count: records of the last `read`. is_plain: all of them are classical (16 bytes), stamped, and told of no drop;
+    `plain` and `stamps` have them then, `stamped` in any case. drops: the running total last told, -1 for none.
+    is_untold: with a record that was not plain there was more to tell, of drops, than there was room for.
+    """
+
+    def __init__(self) -> None:
+        self.count: int = 0
+        self.is_plain: bool = False
+        self.drops: int = -1
+        self.is_untold: bool = False
+        self._socket: socket.socket | None = None
+        self._read_many: Callable[[], int] | None = None
+        self._found: list[Stamped] = []  # of records that are not plain
+        self._error: OSError | None = None
+        self._records: Final[bytearray] = bytearray(SLOTS * RECORD_SIZE)
+        self._controls: Final[bytearray] = bytearray(SLOTS * _CONTROL_SIZE)
+        self._first_record: Final = memoryview(self._records)[:_PLAIN_SIZE]
+        self._slots: Final = (_Slot * SLOTS)()
+        self._vectors: Final = (_Vector * SLOTS)()
+        self._slots_at: Final = ctypes.c_void_p(ctypes.addressof(self._slots))
+        heads = memoryview(self._slots).cast("B")
+        fresh = self._lay_out()
+        # by the number of records: the heads; as they have to be before a call, and as plain records leave them, from
+        # a bus and (MSG_DONTROUTE) from a socket of this machine
+        self._views: Final = [heads[: number * _SLOT_SIZE] for number in range(SLOTS + 1)]
+        self._fresh: Final = _beginnings(fresh)
+        self._plain: Final = _beginnings(_as_plain(fresh, 0))
+        self._plain_local: Final = _beginnings(_as_plain(fresh, socket.MSG_DONTROUTE))
+
+    def attach(self, can: socket.socket) -> None:
+        """Read from this socket from now on; no drop of it has been told yet."""
+        self.drops = -1
+        self._socket = can
+        self._error = None
+        call = find_recvmmsg()
+        # all arguments made beforehand: converting them costs as much as the call
+        many = None if call is None else partial(call, can.fileno(), self._slots_at, SLOTS, socket.MSG_DONTWAIT, None)
+        self._read_many = many
+
+    def read(self) -> int:
+        """Take up to `SLOTS` records without waiting; how many. Raises OSError, BlockingIOError when there is none."""
+        many = self._read_many
+        if many is None:
+            return self._read_singly()
+        count = many()
+        if count < 0:
+            return self._fail()
+        self.count = count
+        heads = self._views[count].tobytes()
+        if heads == self._plain[count] or heads == self._plain_local[count]:
+            self.is_plain = True  # and room is left for a stamp only: a drop count shows as truncated (MSG_CTRUNC)
+        else:
+            self.is_plain = False
+            self._views[count][:] = self._fresh[count]
+            self._take_apart(heads)
+        return count
+
+    def first(self) -> tuple[bytes, int, int]:
+        """The first of plain records, with its stamp: seconds and nanoseconds of CLOCK_REALTIME."""
+        seconds, nanos = _FIRST_STAMP(self._controls, _STAMP_AT)
+        return self._first_record.tobytes(), seconds, nanos
+
+    def plain(self) -> Iterator[tuple[bytes]]:
+        """The plain records, 16 bytes each."""
+        return _RECORDS.iter_unpack(memoryview(self._records)[: self.count * RECORD_SIZE])
+
+    def unpack(self, layout: struct.Struct) -> Iterator[tuple[int, int]]:
+        """Two fields of every plain record. layout: of `RECORD_SIZE` bytes."""
+        return layout.iter_unpack(memoryview(self._records)[: self.count * RECORD_SIZE])
+
+    def stamps(self) -> Iterator[tuple[int, int]]:
+        """The stamps of the plain records: seconds and nanoseconds of CLOCK_REALTIME."""
+        return _STAMPS.iter_unpack(memoryview(self._controls)[: self.count * _CONTROL_SIZE])
+
+    def stamped(self) -> list[Stamped]:
+        """All records of the last `read`, of whatever size."""
+        if not self.is_plain:
+            return self._found
+        found = []
+        for (record,), (seconds, nanos) in zip(self.plain(), self.stamps(), strict=True):
+            found.append((seconds * _SECOND + nanos, record))
+        return found
+
+    def _lay_out(self) -> bytes:
+        """Point every slot at its place; the heads as they have to be before a call."""
+        records = (ctypes.c_char * len(self._records)).from_buffer(self._records)
+        controls = (ctypes.c_char * len(self._controls)).from_buffer(self._controls)
+        for number in range(SLOTS):
+            vector = self._vectors[number]
+            vector.base = ctypes.addressof(records) + number * RECORD_SIZE
+            vector.size = RECORD_SIZE
+            message = self._slots[number].message
+            message.vectors = ctypes.addressof(vector)
+            message.vector_count = 1
+            message.control = ctypes.addressof(controls) + number * _CONTROL_SIZE
+            message.control_size = _CONTROL_SIZE
+        return bytes(self._slots)
+
+    def _take_apart(self, heads: bytes) -> None:
+        """Records of any size, with any control messages."""
+        self._found = []
+        self.is_untold = False
+        for number in range(self.count):
+            slot = _Slot.from_buffer_copy(heads, number * _SLOT_SIZE)
+            if slot.message.flags & socket.MSG_CTRUNC:
+                self.is_untold = True
+            at = number * _CONTROL_SIZE
+            stamp = self._controls_in(self._controls[at : at + min(slot.message.control_size, _CONTROL_SIZE)])
+            at = number * RECORD_SIZE
+            self._found.append((stamp, bytes(self._records[at : at + slot.size])))
+
+    def _controls_in(self, controls: bytes | bytearray) -> int:
+        """Note the drops told in these control messages (cmsg(3)); the stamp."""
+        stamp = -1
+        at = 0
+        while at + _CONTROL_HEAD.size < len(controls):
+            size, level, kind = _CONTROL_HEAD.unpack_from(controls, at)
+            if level == socket.SOL_SOCKET:
+                stamp = self._note(kind, controls[at + _CONTROL_HEAD.size : at + size], stamp)
+            at += max(size + -size % _ALIGNED, _CONTROL_HEAD.size)
+        return stamp
+
+    def _note(self, kind: int, content: bytes | bytearray, stamp: int) -> int:
+        if kind == SO_TIMESTAMPNS and len(content) >= _TIME.size:
+            seconds, nanos = _TIME.unpack_from(content)
+            return int(seconds) * _SECOND + int(nanos)
+        if kind == SO_RXQ_OVFL and len(content) >= _COUNT.size:
+            self.drops = _COUNT.unpack_from(content)[0]
+        return stamp
+
+    def _fail(self) -> int:
+        """What the call says when it gives nothing."""
+        self.count = 0
+        code = ctypes.get_errno()
+        if code in _MISSING:
+            self._read_many = None
+            return self._read_singly()
+        raise OSError(code, os.strerror(code))
+
+    def _read_singly(self) -> int:
+        can = self._socket
+        self._found = []
+        self.count = 0
+        self.is_plain = False
+        if self._error is not None:
+            error, self._error = self._error, None
+            raise error
+        try:
+            while can is not None and len(self._found) < SLOTS:
+                record, controls, _, _ = can.recvmsg(RECORD_SIZE, _CONTROL_SIZE, socket.MSG_DONTWAIT)
+                stamp = -1
+                for level, kind, content in controls:
+                    if level == socket.SOL_SOCKET:
+                        stamp = self._note(kind, content, stamp)
+                self._found.append((stamp, record))
+        except OSError as error:
+            if not self._found:
+                raise
+            if not isinstance(error, BlockingIOError):
+                self._error = error  # what was read comes first
+        self.count = len(self._found)
+        return self.count
+
+
+def _as_plain(fresh: bytes, flags: int) -> bytes:
+    """The heads after a call that filled every slot with a plain record. flags: as the kernel sets them."""
+    slots = (_Slot * SLOTS).from_buffer_copy(fresh)
+    for slot in slots:
+        slot.message.control_size = _STAMP_SIZE
+        slot.message.flags = flags
+        slot.size = _PLAIN_SIZE
+    return bytes(slots)
+
+
+def _beginnings(heads: bytes) -> list[bytes]:
+    """The first heads, for every number of them."""
+    return [heads[: number * _SLOT_SIZE] for number in range(SLOTS + 1)]
+
+
+def find_recvmmsg() -> Callable[..., int] | None:
+    """The C library's function, which never waits and so keeps the interpreter's lock; None where there is none."""
+    if sys.platform != "linux":
+        return None
+    return getattr(ctypes.PyDLL(None, use_errno=True), "recvmmsg", None)

@@ -1,0 +1,82 @@
+"""Runs against the clock on a machine that may be busy: a late one is repeated twice at most, the third one skips.
+
+What does not hang on time (nothing lost, order, orderly end) is asserted by the attempt itself, even when it was late.
+"""
+
+import re
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Final, TypeVar, final
+
+import pytest
+
+from canopen_exo.bus.lateness import Lateness
+
+TRIES: Final = 3
+"""Of a run that is late."""
+
+PATIENCE_S: Final = 90.0
+"""Of a session, for attempts that were late. Used up, every further test has one."""
+
+BUSY: Final = "this machine is too busy for real time"
+"""How the reason of such a skip begins; the count at the end of `make test` goes by it."""
+
+_TIMING: Final = re.compile(
+    r"timing: (\d+) of (\d+) cycles late, SYNC off by at most ([\d.]+) ms; (\d+) frames not heard"
+)
+
+T = TypeVar("T")
+
+
+@final
+@dataclass(frozen=True, slots=True)
+class Late:
+    """An attempt that was late, and why."""
+
+    why: str
+
+
+@final
+class Patience:
+    """Repeats what was late: twice, until that did not help once, or all of it together has taken long."""
+
+    def __init__(self, patience_s: float = PATIENCE_S, clock: Callable[[], float] = time.monotonic) -> None:
+        self._left_s = patience_s
+        self._tries = TRIES
+        self._clock: Final = clock
+
+    def until_punctual(self, attempt: Callable[[], T | Late]) -> T:
+        """What an attempt gives that is not late; skips when all were."""
+        told: list[str] = []
+        for _ in range(self._tries):
+            begun = self._clock()
+            got = attempt()
+            if not isinstance(got, Late):
+                return got
+            told.append(got.why)
+            self._left_s -= self._clock() - begun
+            if self._left_s <= 0:
+                break
+        self._tries = 1
+        pytest.skip(f"{BUSY}: {'; again: '.join(told)}")
+
+
+def distributions(lateness: Mapping[str, Lateness]) -> str:
+    """By name, in words, for the reason of a skip."""
+    return ", ".join(f"{name}: {one.words()}" for name, one in lateness.items() if one.count)
+
+
+def told_late(output: str, cycle_ms: float) -> list[str]:
+    """What a pytest run with the plug-in printed that shows a rig too late for its test; empty for one that kept time.
+
+    Its `timing:` lines say so when a cycle was late, a SYNC off by half a cycle, a frame not heard, or none complete.
+    """
+    found = [line for line in output.splitlines() if "not ready after" in line]
+    for line in output.splitlines():
+        told = _TIMING.match(line)
+        if told is not None:
+            late, cycles, off_ms, missed = (float(one) for one in told.groups())
+            if late or not cycles or off_ms > cycle_ms / 2 or missed:
+                found.append(line)
+    return found

@@ -1,0 +1,58 @@
+"""What `make test` says last."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.parity.patience import BUSY
+from tests.summary import WIDTH, summarise
+
+ROOT = Path(__file__).resolve().parent.parent
+
+TESTS = f'''
+import pytest
+
+def test_passes(): pass
+@pytest.mark.parametrize("number", range(3))
+def test_late(number): pytest.skip("{BUSY}: late by 1 ms,\\n50 % within 0.5 ms, " + "x" * {WIDTH})
+def test_elsewhere(): pytest.skip("there is no such device here")
+'''
+
+
+@pytest.fixture
+def report(tmp_path: Path) -> Path:
+    """Of one pytest run, as the recipes make it."""
+    (tmp_path / "test_some.py").write_text(TESTS)
+    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "--junitxml=some.xml", "test_some.py"]
+    subprocess.run(command, cwd=tmp_path, capture_output=True, timeout=100)
+    return tmp_path / "some.xml"
+
+
+def test_skipped_are_counted_with_their_reasons(report: Path) -> None:
+    """Most frequent first, each in a line; those of a busy machine are counted by themselves."""
+    lines, is_well = summarise([report, report], None)
+    assert is_well
+    assert lines[0] == "make test: 2 passed, 8 skipped, 6 of them because the machine was too busy"
+    assert lines[1].startswith(f"  skipped 6: {BUSY}: late by 1 ms, 50 % within 0.5 ms, xxx")
+    assert lines[1].endswith("x ...")
+    assert lines[2:] == ["  skipped 2: there is no such device here"]
+
+
+def test_compiled_build_that_is_missing_counts_as_skipped(report: Path) -> None:
+    """It is no pytest run, and part of `make test` all the same."""
+    lines, _ = summarise([report], "there is no C compiler")
+    assert "5 skipped" in lines[0]
+    assert "  skipped 1: compiled build: there is no C compiler" in lines
+
+
+@pytest.mark.parametrize("content", [None, "<testsuites>", '<a><testcase name="test_x"><failure/></testcase></a>'])
+def test_part_that_failed_or_left_no_report_is_no_success(tmp_path: Path, content: str | None) -> None:
+    """Nothing is called passed that did not pass."""
+    path = tmp_path / "unit.xml"
+    if content is not None:
+        path.write_text(content)
+    lines, is_well = summarise([path], None)
+    assert not is_well
+    assert str(path) in lines[-1]
