@@ -307,6 +307,8 @@ def drive_rig(pdos: bool) -> tuple[Bus, Drive, BaseNode402]:
     drive = Drive(od, ENCODER, VELOCITY)
     bus = Bus(Device(od, NODE, drive))
     node = BaseNode402(NODE, DESCRIPTION)
+    for limit in ("SWITCH_OP_MODE", "SWITCH_STATE_SINGLE", "SWITCH_STATE_FINAL", "CHECK_TPDO"):
+        setattr(node, f"TIMEOUT_{limit}", 60.0)  # 0.2 to 0.8 s otherwise: a machine that is busy pauses that long
     bus.network.add_node(node)
     bus.run(10 * MS)
     node.pdo.read()

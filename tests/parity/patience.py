@@ -16,7 +16,7 @@ from canopen_exo.bus.lateness import Lateness
 TRIES: Final = 3
 """Of a run that is late."""
 
-PATIENCE_S: Final = 90.0
+PATIENCE_S: Final = 60.0
 """Of a session, for attempts that were late. Used up, every further test has one."""
 
 BUSY: Final = "this machine is too busy for real time"

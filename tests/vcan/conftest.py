@@ -9,14 +9,16 @@ Where there is no SocketCAN to be had they are skipped, and the reason says what
 import json
 import os
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, final
+from typing import Final, NoReturn, final
 
 import pytest
 
+from tests.parity.patience import BUSY
 from tests.vcan import uml
 
 INSIDE: Final = Path(__file__).resolve().parent / "inside"
@@ -25,6 +27,9 @@ CACHE: Final = Path(__file__).resolve().parents[2] / ".cache" / "vcan"
 REPORTS_TO: Final = "EXO_HIL_VCAN_REPORTS"
 """Set for the inner pytest: the file that it appends its reports to, one JSON document a line."""
 
+HANGS_S: Final = 180.0
+"""A test that takes so long hangs: more than anything inside waits for."""
+
 LIMIT_S: Final = 420.0
 """For all of them; alone on a machine they take a quarter of it, what waits for a clock may be repeated twice."""
 
@@ -32,11 +37,22 @@ LIMIT_S: Final = 420.0
 @final
 @dataclass(frozen=True, slots=True)
 class InnerRun:
-    """reports: of the inner pytest, by node id and phase; output: what it printed; refusal: why it could not be run."""
+    """reports: of the inner pytest, by node id and phase; output: what it printed; refusal: why it could not be run.
+
+    stopped_s: when it was stopped at its limit, s since 1970; 0 when it came to its end.
+    """
 
     reports: dict[tuple[str, str], pytest.TestReport]
     output: str
     refusal: str
+    stopped_s: float
+
+    def missing(self, node_id: str) -> NoReturn:
+        """There is no report of this test: fails, unless it had no time left."""
+        begun = self.reports.get((node_id, "setup"))
+        if self.stopped_s and (begun is None or self.stopped_s - begun.stop < HANGS_S):
+            pytest.skip(f"{BUSY}: {LIMIT_S:g} s were not enough for all tests on SocketCAN")
+        pytest.fail(f"no report from inside:\n{self.output[-5000:]}", pytrace=False)
 
 
 @final
@@ -72,8 +88,9 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
     """It has run inside; one that left no report did not come to its end there."""
     if not is_borrowed(pyfuncitem):
         return None
-    if (pyfuncitem.nodeid, "call") not in inner_run_of(pyfuncitem).reports:
-        pytest.fail(f"no report from inside:\n{inner_run_of(pyfuncitem).output[-5000:]}", pytrace=False)
+    run = inner_run_of(pyfuncitem)
+    if (pyfuncitem.nodeid, "call") not in run.reports:
+        run.missing(pyfuncitem.nodeid)
     return True
 
 
@@ -100,28 +117,28 @@ def inner_run(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathF
     with locked(folder / "lock"):
         ended = folder / "ended"
         if not ended.exists():
-            output, refusal = run_inside([item.nodeid for item in request.session.items if is_borrowed(item)],
-                                         request.config, folder)
-            ended.write_text(json.dumps([output, refusal]), encoding="utf-8")
-        output, refusal = json.loads(ended.read_text(encoding="utf-8"))
+            told = run_inside([item.nodeid for item in request.session.items if is_borrowed(item)],
+                              request.config, folder)
+            ended.write_text(json.dumps(told), encoding="utf-8")
+        output, refusal, stopped_s = json.loads(ended.read_text(encoding="utf-8"))
     if refusal:
         pytest.skip(refusal)
-    return InnerRun(read_reports(request.config, folder / "reports"), output, refusal)
+    return InnerRun(read_reports(request.config, folder / "reports"), output, refusal, stopped_s)
 
 
-def run_inside(node_ids: list[str], config: pytest.Config, folder: Path) -> tuple[str, str]:
-    """One inner pytest over these tests; what it printed, and why it could not be run ("" when it could)."""
+def run_inside(node_ids: list[str], config: pytest.Config, folder: Path) -> tuple[str, str, float]:
+    """One inner pytest over these tests; the last three fields of InnerRun."""
     reports = folder / "reports"
     root = config.rootpath
     command = [sys.executable, "-P", "-m", "pytest", "-p", "no:xdist", "--rootdir", str(root)]
     command += ["-c", str(config.inipath or root / "pyproject.toml"), *(f"{root}/{node_id}" for node_id in node_ids)]
     environment = {REPORTS_TO: str(reports), "PYTHONDONTWRITEBYTECODE": "1", "PYTEST_ADDOPTS": ""}
     try:
-        return uml.run(command, folder, LIMIT_S, environment, cache=CACHE)[1], ""
+        return uml.run(command, folder, LIMIT_S, environment, cache=CACHE)[1], "", 0.0
     except uml.CommandTimeoutError as error:
-        return str(error), ""
+        return str(error), "", time.time()
     except uml.VcanError as error:
-        return str(error), "" if reports.exists() else f"no SocketCAN for this test: {error}"
+        return str(error), "" if reports.exists() else f"no SocketCAN for this test: {error}", 0.0
 
 
 def read_reports(config: pytest.Config, path: Path) -> dict[tuple[str, str], pytest.TestReport]:

@@ -35,7 +35,7 @@ MODULES = ("net/can/can", "drivers/net/can/dev/can-dev", "net/can/can-raw", "net
            "drivers/net/can/vcan", "drivers/net/can/vxcan", "net/sched/sch_tbf")
 MOUNTS = (("proc", "/proc"), ("sysfs", "/sys"), ("tmpfs", "/run"), ("tmpfs", "/dev/shm"), ("devpts", "/dev/pts"))
 HIDDEN = ("/proc", "/sys", "/run", "/dev")  # what the host has there cannot be seen inside UML
-FETCH_LIMIT_S = 120.0  # for all that comes from a package source; some 20 MB
+FETCH_LIMIT_S = 100.0  # for all that comes from a package source; some 20 MB
 BOOT_LIMIT_S = 60.0  # start and halt take 0.5 s on an idle machine; the rest is for a crowded one
 
 CLONE_NEWUSER, CLONE_NEWNET, POWER_OFF, SYS_FINIT_MODULE = 0x10000000, 0x40000000, 0x4321FEDC, 313  # 313: x86-64
