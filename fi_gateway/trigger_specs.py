@@ -74,7 +74,7 @@ class TriggerSpec(SpecModel):
     frame: PatternSpec | None = None
     on: Signal = "activated"
     edge: Literal["rising", "level"] = "rising"
-    delay_ns: Annotated[Time, Field(alias="delay")] = 0
+    delay_ns: Annotated[Time, Field(alias="delay", json_schema_extra={"default": "0 s"})] = 0
     probability: Share = 1.0
 
     def __post_init__(self) -> None:

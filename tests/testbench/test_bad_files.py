@@ -44,7 +44,7 @@ TABLE: list[tuple[str, ...]] = [
     ("key missing", "rig: {plant: suspended, stops: off,", "§rig: {plant: suspended,", "rig.stops", "plant, stops"),
     ("key given twice", "seed: 2020", "seed: 2020\n§seed: 2021", "seed: given twice", "first at 4:1"),
     ("injector given twice", "  zero:", "  §freeze:", "injectors.freeze: given twice", "first at 6:3"),
-    ("key of a later version", "{any:", "{§delay: 1 ms, any:", "delay: not available yet", "any, on"),
+    ("key of a later version", "{plant:", "{§file: rig.yaml, plant:", "file: not available yet", "plant, stops"),
     # --- quantities
     ("wrong unit", "duration: 7 s", "duration: §7 deg", "'7 deg' is an angle", "a duration is wanted", "s, ms, us"),
     ("unknown unit", "rate: 500 Hz", "rate: §500 herz", "unknown unit 'herz'", "Hz, kHz"),
