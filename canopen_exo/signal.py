@@ -64,12 +64,6 @@ class Signal:
         """SI value of a raw integer."""
         return raw * self.scale
 
-    def __reduce__(self) -> tuple[type["Signal"], tuple[str | int | float | bool, ...]]:
-        """Copied through the constructor: a frozen class, once compiled, cannot be copied otherwise."""
-        what = (self.name, self.node, self.message, self.cob_id)
-        where = (self.start, self.length, self.signed)
-        return Signal, (*what, *where, self.scale, self.unit, self.index, self.sub)
-
 
 def read_bits(data: bytes, start: int, length: int, signed: bool) -> int:
     """Raw integer at bit `start` (little endian), two's complement when `signed`."""
