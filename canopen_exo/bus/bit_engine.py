@@ -72,14 +72,16 @@ _UNKNOWN: Final = 1 << 20
 class Detected:
     """An error that a controller noticed. at: bit; kind: see above; transmitting: it was the sender.
 
-    place: state it was in; index: destuffed bits before it (FRAME) or position (others); extended: as far as known.
+    place: state it was in; index: destuffed bits before it (FRAME) or position (others); extended, size (destuffed bits
+    SOF..CRC): as far as known. tec, rec: afterwards.
     """
 
-    __slots__ = ("at", "extended", "index", "kind", "place", "size", "transmitting")
+    __slots__ = ("at", "extended", "index", "kind", "place", "rec", "size", "tec", "transmitting")
 
     def __init__(
-        self, at: int, kind: int, transmitting: bool, place: int, index: int, extended: bool, size: int
-    ) -> None:
+        self, at: int, kind: int, transmitting: bool, place: int, index: int, extended: bool, size: int,
+        tec: int, rec: int,
+    ) -> None:  # fmt: skip
         self.at: Final[int] = at
         self.kind: Final[int] = kind
         self.transmitting: Final[bool] = transmitting
@@ -87,6 +89,8 @@ class Detected:
         self.index: Final[int] = index
         self.extended: Final[bool] = extended
         self.size: Final[int] = size
+        self.tec: Final[int] = tec
+        self.rec: Final[int] = rec
 
 
 @final
@@ -113,7 +117,8 @@ class Controller:
     """
 
     __slots__ = (
-        "_acks", "_arbitration_bits", "_count", "_crc", "_cursor", "_extended", "_is_overload", "_last", "_overloads",
+        "_acks", "_arbitration_bits", "_count", "_crc", "_cursor", "_extended", "_has_failed",
+        "_is_overload", "_last", "_overloads",
         "_passive", "_pending_ack", "_position", "_run", "_sending", "_stream", "_total", "_value", "accepted",
         "accepted_at", "counted", "found", "frame", "idle_at", "out", "ports", "rec", "sent_at", "state", "suspends",
         "tec", "transmitter",
@@ -151,6 +156,7 @@ class Controller:
         self._is_overload: bool = False
         self._pending_ack: bool = False
         self._overloads: int = 0
+        self._has_failed: bool = False
 
     # --- what the medium asks ------------------------------------------------------------------------------------
 
@@ -163,6 +169,16 @@ class Controller:
     def will_drive(self) -> bool:
         """It may send a dominant bit though nobody sends anything new."""
         return self.state == FRAME or self.state == TAIL or (self.state == FLAG and not self._passive)
+
+    @property
+    def may_join(self) -> bool:
+        """It has seen an SOF in the last bit of its intermission, and may send its own frame from the id on."""
+        return self.state == FRAME and self._count == 1 and not self._sending
+
+    @property
+    def has_failed(self) -> bool:
+        """It saw an error in a frame of its own."""
+        return self._has_failed
 
     @property
     def idle_in(self) -> int:
@@ -324,10 +340,9 @@ class Controller:
 
     def _error(self, at: int, kind: int, spared: bool = False) -> None:
         """Note an error and send a flag from the next bit on. spared: the TEC does not grow."""
-        index = self._count if self.state == FRAME else self._position
-        self.found.append(
-            Detected(at, kind, self.transmitter, self.state, index, self._extended, self._total)
-        )
+        place = self.state
+        index = self._count if place == FRAME else self._position
+        self._has_failed = self._has_failed or self._sending
         passive = is_passive(self.tec, self.rec)
         self._sending = False
         self._pending_ack = passive and kind == ACK_ERROR
@@ -335,7 +350,13 @@ class Controller:
             self._apply(at, RX_ERROR)
         elif not self._pending_ack and not spared:
             self._apply(at, TX_ERROR)
+        self._note(at, kind, place, index)
         self._start_flag(passive, False)
+
+    def _note(self, at: int, kind: int, place: int, index: int) -> None:
+        self.found.append(
+            Detected(at, kind, self.transmitter, place, index, self._extended, self._total, self.tec, self.rec)
+        )
 
     def _overload(self, at: int) -> None:
         if self._overloads == OVERLOADS:
@@ -363,9 +384,9 @@ class Controller:
             if self._run < FLAG_LENGTH:
                 return
         elif seen:
-            self.found.append(Detected(at, BIT_DOMINANT, self.transmitter, FLAG, self._position, False, 0))
             passive = is_passive(self.tec, self.rec)
             self._apply(at, TX_FLAG_BIT if self.transmitter else RX_FLAG_BIT)
+            self._note(at, BIT_DOMINANT, FLAG, self._position)
             self._start_flag(passive, False)
             return
         else:

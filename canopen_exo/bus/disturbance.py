@@ -1,7 +1,6 @@
 """What disturbs the bits of a bus, as the medium asks for it.
 
-A Disturbance is asked once for every attempt to send a frame, and answers with what happens to which bits, and who sees
-it.
+A Disturbance is asked once for every attempt to send a frame, and answers with what happens to which bits, and to whom.
 Nothing here knows chance or scenarios: noise and faults are made of it in `fi_gateway.wire_faults`.
 """
 
