@@ -1,7 +1,7 @@
 """What came of an attempt that the bit engine worked out, as steps in the order in which they happen.
 
-Source: see `bit_engine`. A frame counts as received at the end of its intermission, as on an undisturbed bus, although a
-receiver accepts it with the last but one bit of EOF, four bits before.
+Source: see `bit_engine`. A frame counts as received at the end of its intermission, as on an undisturbed bus, although
+a receiver accepts it with the last but one bit of EOF, four bits before.
 """
 
 from typing import Final, final

@@ -68,11 +68,16 @@ class Loop:
         for sender in medium.ports:
             listeners: list[tuple[Node, int, Out]] = []
             for node, out in zip(self.nodes, self.outs, strict=True):
-                for port in range(len(out.ports)):
-                    own = out.ports[port]
-                    if own.medium is medium and own is not sender and own.state is not ErrorState.BUS_OFF:
-                        listeners.append((node, port, out))
-                        break
+                hearing: list[int] = []
+                deaf = False
+                for port, own in enumerate(out.ports):
+                    if own.medium is medium and own is not sender:
+                        if own.state is ErrorState.BUS_OFF:
+                            deaf = True
+                        else:
+                            hearing.append(port)
+                if hearing:
+                    listeners.append((_Part(node, hearing) if deaf else node, hearing[0], out))
             sender.listeners = listeners
 
     def install(self, wire: Wiring, medium: Medium) -> None:
@@ -198,6 +203,20 @@ class Loop:
                         f"it is {now} ns; wake() must move wake_at on"
                     )
         return self._first_wake()
+
+
+@final
+class _Part(Node):
+    """A node of which only these ports hear, because the others are bus-off."""
+
+    def __init__(self, node: Node, ports: list[int]) -> None:
+        super().__init__()
+        self.node: Final[Node] = node
+        self.ports: Final[list[int]] = ports
+
+    def receive(self, now: int, port: int, frame: Frame, out: Out) -> None:
+        self.node.receive_on(now, self.ports, frame, out)
+        self.wake_at = self.node.wake_at
 
 
 @final
