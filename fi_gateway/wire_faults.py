@@ -2,8 +2,8 @@
 
 A frame that these faults hit is noticed as wrong by its receivers or its sender and sent again, so they cost time, not
 data. The exception is real: of errors that only some receivers see, some double ones leave a valid CRC. (A payload that
-is wrong because a sensor, a memory or a program is, models something upstream of the CAN controller: that is made by the
-faults of a gateway.)
+is wrong because a sensor, a memory or a program is, models something upstream of the CAN controller: that is made by
+the faults of a gateway.)
 Every fault acts from `begin` to `end`. Ports are numbers on the medium.
 Sources: ISO 11898-1 for what the bits are; E. N. Gilbert, "Capacity of a burst-noise channel", Bell System Technical
 Journal 39 (1960), and E. O. Elliott, ibid. 42 (1963), for bursts.

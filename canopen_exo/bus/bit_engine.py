@@ -112,7 +112,7 @@ class Controller:
 
     frame: what it sends or wants to send; transmitter: it is the sender of the frame under way, also while error frames
     follow; sent_at, accepted_at: bits at which it knew its frame sent, and another one received (-1: not);
-    accepted: that frame; idle_at: bit after which the bus is idle for it; suspends: it must wait 8 bits more then.
+    accepted: that frame; idle_at: last bit of its intermission; suspends: it must wait 8 bits more then.
     found, counted: what happened in this attempt.
     """
 
@@ -427,6 +427,8 @@ class Controller:
         elif self._position < INTERMISSION_LENGTH - 1:
             self._overload(at)
         else:  # somebody's SOF
+            self.suspends = self.transmitter and is_passive(self.tec, self.rec)
+            self.idle_at = at
             self._begin()
             self._field(at, seen)
 
@@ -489,14 +491,14 @@ def run(controllers: list[Controller], disruptions: list[Disruption], limit: int
             controller.step(at, _view(acting, at, controller, bus) if disturbed else bus)
             if controller.idle_at == at:
                 finished = True
-            elif controller.state != IDLE and controller.state != OFF:
+            if controller.state != IDLE and controller.state != OFF:
                 busy = True
         if not busy:
             return at + 1
         if finished:
             for controller in controllers:
-                busy = busy and not controller.is_sending
-            if busy:
+                finished = finished and not controller.is_sending
+            if finished:
                 return at + 1
     return limit
 

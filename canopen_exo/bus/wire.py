@@ -339,6 +339,11 @@ class Wire(Wiring):
         if port.restart_ns != NEVER:
             self._recoveries.append(Recovery(port, now + port.restart_ns))
 
+    def reconsider(self) -> None:
+        """Counters or states of ports were set from outside."""
+        self._weigh()
+        self._is_calm = False
+
     def switch_off(self, now: int, port: Port) -> None:
         """Make a port bus-off, whatever its counters; it restarts as from any bus-off."""
         if is_present(port):
