@@ -151,6 +151,11 @@ def write_bus_error(error: Detected) -> tuple[int, bytes]:
     return can_id, bytes((0, 0, detail, _location(error), 0, 0, _byte(error.tec), _byte(error.rec)))
 
 
+def of_another(can_id: int, data: bytes) -> tuple[int, bytes]:
+    """A bus error as another controller would tell it: not the sender's, and without counters."""
+    return can_id & ~_COUNTERS, bytes((0, 0, data[2] & 0x7F, data[3], 0, 0, 0, 0))
+
+
 def _location(error: Detected) -> int:
     """Where in the frame, in the codes of linux/can/error.h; 0 within error frames, for which it has none."""
     if error.place == FRAME:

@@ -180,7 +180,7 @@ class Medium:
         if frame.flags & (FLAG_FD | FLAG_ERROR):
             kind = "CAN FD frame" if frame.flags & FLAG_FD else "error frame"
             raise CanopenExoError(f"medium {self.name!r}: {kind} {frame!r} given; this bus is classical CAN")
-        if port.state is ErrorState.BUS_OFF:
+        if port.state is ErrorState.BUS_OFF or port.state is ErrorState.DOWN:
             port.lost += 1
             return
         waiting = self.waiting

@@ -329,15 +329,19 @@ class Wire(Wiring):
 
     def _go_off(self, now: int, port: Port) -> None:
         """Bus-off: nothing is sent or received until the restart; what waits is lost."""
-        waiting = self.medium.waiting
-        kept = [entry for entry in waiting if entry[1] is not port]
-        port.lost += len(waiting) - len(kept)
-        waiting[:] = kept
-        port.waiting = _CLOSED
-        self._absent += 1
-        self._is_calm = False
+        self._close(port)
         if port.restart_ns != NEVER:
             self._recoveries.append(Recovery(port, now + port.restart_ns))
+
+    @property
+    def is_plain(self) -> bool:
+        """What is on the wire, if anything, is not worked out by the bit engine."""
+        return not self._steps
+
+    @staticmethod
+    def hears(port: Port) -> bool:
+        """It takes part in the bus."""
+        return is_present(port)
 
     def reconsider(self) -> None:
         """Counters or states of ports were set from outside."""
@@ -355,6 +359,35 @@ class Wire(Wiring):
             self._plan_wake(now)
             self.sink.happened(now, events)
 
+    def disconnect(self, now: int, port: Port) -> None:
+        """Its node is unplugged: what waits is lost, and nobody acknowledges there any more."""
+        if is_present(port):
+            self._close(port)
+        self._recoveries = [one for one in self._recoveries if one.port is not port]
+        port.state = ErrorState.DOWN
+        self._plan_wake(now)
+
+    def connect(self, now: int, port: Port) -> None:
+        """A node is plugged in where one was unplugged."""
+        if port.state is ErrorState.DOWN:
+            self._open(now, port)
+            port.state = ErrorState.ERROR_ACTIVE
+
+    def _close(self, port: Port) -> None:
+        waiting = self.medium.waiting
+        kept = [entry for entry in waiting if entry[1] is not port]
+        port.lost += len(waiting) - len(kept)
+        waiting[:] = kept
+        port.waiting = _CLOSED
+        self._absent += 1
+        self._is_calm = False
+
+    def _open(self, now: int, port: Port) -> None:
+        port.tec = port.rec = 0
+        port.ready_ns = now
+        port.waiting = self.medium.waiting
+        self._absent -= 1
+
     def _finish_recoveries(self, now: int, events: list[WireEvent]) -> None:
         """Restart the ports that have seen enough recessive bits; the bus is idle."""
         bit_ns = self.medium.bit_ns
@@ -364,10 +397,7 @@ class Wire(Wiring):
                 left.append(recovery)
                 continue
             port = recovery.port
-            port.tec = port.rec = 0
-            port.ready_ns = now
-            port.waiting = self.medium.waiting
-            self._absent -= 1
+            self._open(now, port)
             self._change(port, ErrorState.ERROR_ACTIVE, "controller restarted", events)
         self._recoveries = left
 
