@@ -15,9 +15,10 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from canopen_exo.bus.bit_engine import Controller, run, split
+from canopen_exo.bus.bit_engine import run, split
 from canopen_exo.bus.bit_stream import BASE_HEADER, CRC_BITS, STUFF_AFTER, wire_bits
 from canopen_exo.bus.bits import CRC_POLYNOMIAL
+from canopen_exo.bus.controller import Controller
 from canopen_exo.bus.disturbance import FLIP, Disruption
 from canopen_exo.bus.frame import Frame
 

@@ -1,12 +1,12 @@
 """What came of an attempt that the bit engine worked out, as steps in the order in which they happen.
 
-Source: see `bit_engine`. A frame counts as received at the end of its intermission, as on an undisturbed bus, although
+Source: see `controller`. A frame counts as received at the end of its intermission, as on an undisturbed bus, although
 a receiver accepts it with the last but one bit of EOF, four bits before.
 """
 
 from typing import Final, final
 
-from canopen_exo.bus.bit_engine import ACCEPT_TO_END, Controller, Detected
+from canopen_exo.bus.controller import ACCEPT_TO_END, Controller, Detected
 from canopen_exo.bus.frame import Frame
 from canopen_exo.bus.medium import Port
 

@@ -42,7 +42,7 @@ class Rule:
 RULES: Final[list[Rule]] = [
     Rule(0, 1, "a receiver detects an error, but not a bit error while it sends an active error or overload flag"),
     Rule(0, 8, "a receiver sees dominant as the first bit after its error flag"),
-    Rule(8, 0, "a transmitter sends an error flag (`bit_engine` knows the two exceptions)"),
+    Rule(8, 0, "a transmitter sends an error flag (`controller` knows the two exceptions)"),
     Rule(8, 0, "a transmitter has a bit error while it sends an active error or overload flag"),
     Rule(0, 8, "a receiver has a bit error while it sends an active error or overload flag"),
     Rule(8, 0, "a transmitter sees the 8th dominant bit after a flag, and each further 8"),

@@ -7,7 +7,8 @@ cause of a notice but change no state.
 
 from typing import Final
 
-from canopen_exo.bus.bit_engine import (
+from canopen_exo.bus.bit_stream import CRC_BITS
+from canopen_exo.bus.controller import (
     ACK_ERROR,
     BIT_DOMINANT,
     BIT_RECESSIVE,
@@ -19,7 +20,6 @@ from canopen_exo.bus.bit_engine import (
     TAIL,
     Detected,
 )
-from canopen_exo.bus.bit_stream import CRC_BITS
 from canopen_exo.bus.node import ErrorState, PortState
 
 ERROR_FLAG: Final = 0x20000000

@@ -13,6 +13,8 @@ Leaves out: CAN FD, which is refused.
 
 from typing import Final, final
 
+from mypy_extensions import mypyc_attr
+
 from canopen_exo.bus.frame import FLAG_ERROR, FLAG_FD, Frame
 from canopen_exo.bus.node import MS, NEVER, SECOND, ErrorState, Node, Out, PortState
 from canopen_exo.errors import CanopenExoError
@@ -97,6 +99,7 @@ class WireEvent:
         self.state: Final[PortState | None] = state
 
 
+@mypyc_attr(allow_interpreted_subclasses=True)
 class WireSink:
     """Where a Wiring says what happened: a loop, or a hub."""
 

@@ -1,6 +1,6 @@
 """A bus on which errors happen: disturbed attempts, retransmission, error states of the ports, bus-off and restart.
 
-Source: ISO 11898-1 (Bosch CAN 2.0B), fault confinement; `bit_engine` has the bits, `confinement` the counters.
+Source: ISO 11898-1 (Bosch CAN 2.0B), fault confinement; `controller` has the bits, `confinement` the counters.
 An attempt to send goes through the bit engine only when something disturbs it, two nodes send the same arbitration
 bits, nobody is there to acknowledge, or a controller has not come to rest after an earlier error. All others are as on
 the ideal bus, with the counters brought up to date where one is not 0.
@@ -16,15 +16,9 @@ Of the error frames of one attempt the trace shows the first error that somebody
 from typing import Final, final
 
 from canopen_exo.bus.attempt import COUNT, END, ERROR, Step, steps_of
-from canopen_exo.bus.bit_engine import (
-    IDLE,
-    OFF,
-    SUSPEND_LENGTH,
-    Controller,
-    run,
-    split,
-)
+from canopen_exo.bus.bit_engine import run, split
 from canopen_exo.bus.confinement import BUS_OFF_LIMIT, RX_SUCCESS, TX_SUCCESS, count, is_passive, state_of
+from canopen_exo.bus.controller import IDLE, OFF, SUSPEND_LENGTH, Controller
 from canopen_exo.bus.disturbance import NO_ACK, Disruption, Disturbance
 from canopen_exo.bus.error_frame import write_bus_error, write_error_frame
 from canopen_exo.bus.frame import FLAG_ERROR, FLAG_EXTENDED, FLAG_REMOTE, Frame

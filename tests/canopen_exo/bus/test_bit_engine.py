@@ -4,18 +4,7 @@ import numpy as np
 import pytest
 
 from benchmarks.double_flips import pairs_of, wrong_frame
-from canopen_exo.bus.bit_engine import (
-    ACK_ERROR,
-    BIT_DOMINANT,
-    BIT_RECESSIVE,
-    CRC_ERROR,
-    FORM_ERROR,
-    OFF,
-    STUFF_ERROR,
-    Controller,
-    run,
-    split,
-)
+from canopen_exo.bus.bit_engine import run, split
 from canopen_exo.bus.bit_stream import field_positions, wire_bits
 from canopen_exo.bus.confinement import (
     RX_DOMINANT_RUN,
@@ -27,6 +16,16 @@ from canopen_exo.bus.confinement import (
     TX_ERROR,
     TX_FLAG_BIT,
     TX_SUCCESS,
+)
+from canopen_exo.bus.controller import (
+    ACK_ERROR,
+    BIT_DOMINANT,
+    BIT_RECESSIVE,
+    CRC_ERROR,
+    FORM_ERROR,
+    OFF,
+    STUFF_ERROR,
+    Controller,
 )
 from canopen_exo.bus.disturbance import ALL, DOMINANT, FLIP, NO_ACK, Disruption
 from canopen_exo.bus.frame import FLAG_EXTENDED, Frame

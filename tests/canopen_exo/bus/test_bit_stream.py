@@ -4,8 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from canopen_exo.bus.bit_engine import Controller
 from canopen_exo.bus.bit_stream import FIELDS, field_positions, frame_of, unstuffed_bits, wire_bits
+from canopen_exo.bus.controller import Controller
 from canopen_exo.bus.frame import FLAG_EXTENDED, FLAG_REMOTE, Frame
 
 VECTORS = [

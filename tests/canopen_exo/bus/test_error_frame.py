@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from canopen_exo.bus.bit_engine import (
+from canopen_exo.bus.controller import (
     ACK_ERROR,
     BIT_DOMINANT,
     BIT_RECESSIVE,
