@@ -1,5 +1,6 @@
 """A medium on which errors happen: retransmission, error states, bus-off, and who is told."""
 
+import copy
 from itertools import pairwise
 from pathlib import Path
 
@@ -480,6 +481,19 @@ def test_same_disturbances_give_the_same_trace() -> None:
         return trace_hash(bus.loop.trace)
 
     assert run(40 * MS) == run(7 * BIT + 1)
+
+
+def test_copy_taken_within_an_error_frame_goes_on_as_the_original() -> None:
+    """Snapshots: one copy of loop, media, nodes and what disturbs them."""
+    receiver = Talker()
+    bus = Bus([Talker((0, FRAME), (0, FRAME)), receiver], Script([flip()], [flip()]))
+    bus.wire.switch_off(0, bus.medium.ports[1])
+    bus.loop.run_until(80 * BIT)
+    other = copy.deepcopy(bus)
+    for one in (bus, other):
+        one.loop.run_until(200 * MS)
+    assert trace_hash(bus.loop.trace) == trace_hash(other.loop.trace)
+    assert len(bus.loop.trace) > 20
 
 
 def test_cut_ends_an_error_frame_and_mending_lets_the_frame_pass() -> None:
