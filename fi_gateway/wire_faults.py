@@ -231,7 +231,7 @@ class GilbertElliott(Noise):
         _check("gilbert_elliott", "leave", leave)
         for name, rate in (("rate_good", rate_good), ("rate_bad", rate_bad)):
             if not 0 <= rate <= 1:
-                raise FaultError(f"gilbert_elliott: {name} {rate} given, allowed 0..1 per bit")
+                raise FaultError(f"gilbert_elliott: {name} {rate:g} given, allowed 0..1 per bit")
         self.enter: Final[float] = enter
         self.leave: Final[float] = leave
         self.rate_good: Final[float] = rate_good
@@ -315,4 +315,4 @@ _SHORTEST_FRAME: Final = 47
 
 def _check(fault: str, name: str, rate: float) -> None:
     if not 0 < rate <= 1:
-        raise FaultError(f"{fault}: {name} {rate} given, allowed above 0 up to 1 per bit")
+        raise FaultError(f"{fault}: {name} {rate:g} given, allowed above 0 up to 1 per bit")

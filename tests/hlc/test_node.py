@@ -566,7 +566,8 @@ def test_an_emcy_is_noted_and_does_not_stop_the_motion(bench: Bench, code: int) 
 
 
 STOPPING = [0x8110, 0x8120, 0x8130, 0x8140, 0x8250, 0x8700]
-"""Overrun, error passive, heartbeat lost, bus-off left, RPDO deadline, SYNC lost: with them a drive drops its torque (0x6007 = 2)."""
+"""Overrun, error passive, heartbeat lost, bus-off left, RPDO deadline, SYNC lost: with them a drive drops its torque
+(0x6007 = 2)."""
 
 
 @pytest.mark.parametrize("phase", [Phase.STARTING, Phase.MOTION])

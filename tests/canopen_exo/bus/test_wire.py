@@ -116,7 +116,7 @@ def test_undisturbed_bus_gives_the_trace_of_the_ideal_one(sends: list[tuple[int,
         medium = Medium("bus", 0, 1_000_000)
         loop = Loop([medium])
         for node in range(3):
-            mine = sorted((at, Frame(can_id, data)) for at, who, can_id, data in sends if who == node)
+            mine = [(at, Frame(can_id, data)) for at, who, can_id, data in sorted(sends) if who == node]
             loop.connect(Talker(*mine), [medium])
         if with_wire:
             loop.install(Wire(medium, []), medium)
