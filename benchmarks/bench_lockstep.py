@@ -19,12 +19,14 @@ import mujoco
 
 from canopen_exo.bus.frame import Frame
 from canopen_exo.bus.node import MS, SECOND, Out
+from canopen_exo.bus.wire import Wire
 from canopen_exo.plan import RPDO1, SDO_REQUEST, SYNC, TPDO1, BusPlan
 from fi_gateway.effects import Infinite
 from fi_gateway.events import At
 from fi_gateway.faults import Bias
 from fi_gateway.gateway import DRIVE_PORT, Gateway
 from fi_gateway.injector import Injector, Target, stream
+from fi_gateway.wire_faults import BitErrorRate
 from testbench.rig import Rig, RigParams, build_rig
 from testbench.run import drive_through
 from testbench.scenario import default_joints
@@ -36,6 +38,11 @@ RATIO_BUDGET: Final = 13.0
 """Most that a run may cost, in bare mj_step loops."""
 REALTIME_BUDGET: Final = 10.0
 """Least simulated seconds per second of CPU time."""
+
+NOISE: Final = 1e-5
+"""Bit error rate of the noisy run, on both buses."""
+NOISE_BUDGET: Final = 1.5
+"""Most that it may cost, in clean runs."""
 
 CALLS: Final = 2000
 """Calls of a piece between two looks at the clock."""
@@ -102,6 +109,31 @@ def run_figures(stops: bool, repeat: int) -> Figures:
         "run_us_per_ms": statistics.median(whole) / steps * 1e6,
         "ratio": statistics.median(ratios),
         "x_realtime": steps / 1e3 / statistics.median(whole),
+    }
+
+
+def noise_figures(repeat: int) -> Figures:
+    """Medians of runs without errors, with errors possible, and with noise, in turn."""
+    possible, noisy, errors = [], [], 0
+    for number in range(repeat):
+        clean = run_seconds(rig_of(False))
+        rig = rig_of(False)
+        for medium in rig.loop.media:
+            rig.loop.install(Wire(medium, []), medium)
+        possible.append(run_seconds(rig) / clean)
+        rig = rig_of(False)
+        for medium in rig.loop.media:
+            noise = BitErrorRate(NOISE, medium.bit_ns, stream(number, 0, medium.name))
+            noise.begin(0)
+            rig.loop.install(Wire(medium, [noise]), medium)
+        noisy.append(run_seconds(rig) / clean)
+        errors = sum(medium.errors for medium in rig.loop.media)
+    if errors == 0:
+        raise RuntimeError("bench_lockstep: the noise made no error, its figure would be that of a clean run")
+    return {
+        "possible_ratio": statistics.median(possible),
+        "noisy_ratio": statistics.median(noisy),
+        "error_frames": errors,
     }
 
 
@@ -178,6 +210,13 @@ def show(figures: dict[str, Figures]) -> None:
             f"  speed              {run['x_realtime']:8.1f} x real time       "
             f"(budget >= {REALTIME_BUDGET:g}: {verdict(run['x_realtime'] >= REALTIME_BUDGET)})"
         )
+    noise = figures["noise"]
+    print(f"errors on the wire, against a run on ideal buses (last run: {noise['error_frames']:.0f} error frames)")
+    print(f"  possible, none     {noise['possible_ratio']:8.2f} x")
+    print(
+        f"  bit error rate {NOISE:g} {noise['noisy_ratio']:7.2f} x   "
+        f"(budget <= {NOISE_BUDGET:g}: {verdict(noise['noisy_ratio'] <= NOISE_BUDGET)})"
+    )
     print("pieces, for information [us]")
     for name, value in figures["pieces"].items():
         print(f"  {name.replace('_', ' '):28} {value:6.2f}")
@@ -194,10 +233,11 @@ def main() -> int:
     figures = {
         "stops_off": run_figures(False, arguments.repeat),
         "stops_on": run_figures(True, arguments.repeat),
+        "noise": noise_figures(arguments.repeat),
         "pieces": piece_figures(arguments.repeat),
     }
     if arguments.json:
-        budget = {"ratio": RATIO_BUDGET, "x_realtime": REALTIME_BUDGET}
+        budget = {"ratio": RATIO_BUDGET, "x_realtime": REALTIME_BUDGET, "noisy_ratio": NOISE_BUDGET}
         print(json.dumps({"repeat": arguments.repeat, "budget": budget, **figures}, indent=2))
     else:
         show(figures)

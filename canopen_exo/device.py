@@ -9,10 +9,13 @@ from typing import Final, final
 from mypy_extensions import mypyc_attr
 
 from canopen_exo.bus.frame import FLAG_EXTENDED, FLAG_FD, FLAG_REMOTE, Frame
-from canopen_exo.bus.node import MS, NEVER, Node, Out
+from canopen_exo.bus.node import MS, NEVER, ErrorState, Node, Out, PortState
 from canopen_exo.emcy import (
+    BUS_OFF_LEFT,
     COMMUNICATION_BIT,
+    ERROR_PASSIVE,
     HEARTBEAT_LOST,
+    OVERRUN,
     PDO_TOO_LONG,
     PDO_TOO_SHORT,
     RPDO_TIMEOUT,
@@ -69,13 +72,14 @@ class Device(Node):
     """One CANopen device on its port 0. Serves everything by `receive` and `wake`; never raises on received bytes.
 
     port: the port it sends on (a rack of devices gives each its own). malformed: NMT messages of a wrong length.
-    revision: counts changes of what it listens to.
+    revision: counts changes of what it listens to. is_off: its controller is bus-off.
     """
 
     def __init__(self, od: ObjectDictionary, node_id: int, application: Application, port: int = 0) -> None:
         super().__init__()
         self.port: Final[int] = port
         self.revision: int = 0
+        self.is_off: bool = False
         self.now: int = 0
         self.od: Final[ObjectDictionary] = od
         self.node_id: Final[int] = node_id
@@ -131,6 +135,7 @@ class Device(Node):
             self._command(now, data, out)
         elif can_id >= HEARTBEAT:
             self._heartbeat(now, can_id - HEARTBEAT, data)
+        self._interface_works()
         self._send_emcy(now, out)
         self._plan_wake()
 
@@ -157,6 +162,7 @@ class Device(Node):
         if self.emcy.active:
             self.emcy.vanish(SYNC_LENGTH)
             self.emcy.vanish(SYNC_LOST)
+            self._interface_works()
             self._send_emcy(now, out)
             self._plan_wake()
         applied = False
@@ -204,6 +210,37 @@ class Device(Node):
             self.emcy.vanish(PDO_TOO_SHORT)
         if not long:
             self.emcy.vanish(PDO_TOO_LONG)
+
+    # --- the CAN controller ------------------------------------------------------------------------------------------
+
+    def port_changed(self, now: int, state: PortState, out: Out) -> None:
+        """Error states of the controller: bus-off acts at once and is told when it is left (8140).
+
+        Error passive is 8120, objects lost are 8110; 0x6007 and 0x1029 say what they lead to.
+        """
+        self.now = now
+        off = state.state is ErrorState.BUS_OFF or (self.is_off and state.state is ErrorState.DOWN)
+        if off and not self.is_off:
+            self._react(now, BUS_OFF_LEFT, out)
+        elif self.is_off and not off:
+            self.emcy.occur(BUS_OFF_LEFT, COMMUNICATION_BIT)
+        self.is_off = off
+        if state.state is ErrorState.ERROR_PASSIVE:
+            if ERROR_PASSIVE not in self.emcy.active:
+                self._communication_error(now, ERROR_PASSIVE, out)
+        elif not off:
+            self.emcy.vanish(ERROR_PASSIVE)
+        if state.overrun and OVERRUN not in self.emcy.active:
+            self._communication_error(now, OVERRUN, out)
+        if not off:
+            self._send_emcy(now, out)
+        self._plan_wake()
+
+    def _interface_works(self) -> None:
+        """A frame has come: what was lost through the controller is over."""
+        if self.emcy.active:
+            self.emcy.vanish(BUS_OFF_LEFT)
+            self.emcy.vanish(OVERRUN)
 
     # --- time ----------------------------------------------------------------------------------------------------
 
@@ -263,6 +300,10 @@ class Device(Node):
         """EMCY, the reaction of 0x6007 (application) and of 0x1029:1 (NMT state)."""
         self.emcy.occur(code, COMMUNICATION_BIT)
         self._send_emcy(now, out)  # before 1029 may stop the device
+        self._react(now, code, out)
+
+    def _react(self, now: int, code: int, out: Out) -> None:
+        """What the objects 0x6007 (application) and 0x1029:1 (NMT state) say."""
         self.application.communication_lost(now, code)
         behaviour = self.od.values[key_of(0x1029, 1)]
         if behaviour == 0 and self.operational:

@@ -11,6 +11,12 @@ from canopen_exo.bus.node import NEVER
 from canopen_exo.plan import EMCY
 
 NO_ERROR: Final = 0x0000
+OVERRUN: Final = 0x8110
+"""CAN overrun: objects lost."""
+ERROR_PASSIVE: Final = 0x8120
+"""CAN in error passive mode."""
+BUS_OFF_LEFT: Final = 0x8140
+"""Recovered from bus-off."""
 SYNC_LENGTH: Final = 0x8240
 """Unexpected SYNC data length."""
 PDO_TOO_SHORT: Final = 0x8210

@@ -17,7 +17,16 @@ from canopen_exo import plan as ids
 from canopen_exo.bus.frame import Frame
 from canopen_exo.bus.node import MS, NEVER, Out
 from canopen_exo.cia402 import DriveState, decode_statusword, enabling_controlword
-from canopen_exo.emcy import HEARTBEAT_LOST, NO_ERROR, RPDO_TIMEOUT, SYNC_LOST, Emergency
+from canopen_exo.emcy import (
+    BUS_OFF_LEFT,
+    ERROR_PASSIVE,
+    HEARTBEAT_LOST,
+    NO_ERROR,
+    OVERRUN,
+    RPDO_TIMEOUT,
+    SYNC_LOST,
+    Emergency,
+)
 from canopen_exo.master import MasterApplication
 from canopen_exo.plan import BusPlan
 from canopen_exo.signal import Codec
@@ -30,7 +39,7 @@ DISABLE_TIMEOUT_NS: Final = 200 * MS
 """How long the drives may take at least to report that they are disabled; TPDO2 comes with every 10th SYNC."""
 DISABLE_TIMEOUT_CYCLES: Final = 25
 
-STOPPING_ERRORS: Final = (HEARTBEAT_LOST, RPDO_TIMEOUT, SYNC_LOST)
+STOPPING_ERRORS: Final = (HEARTBEAT_LOST, RPDO_TIMEOUT, SYNC_LOST, BUS_OFF_LEFT, ERROR_PASSIVE, OVERRUN)
 """EMCY codes with which a drive drops its torque (its 0x6007 = 2). The statusword says so too, but needs SYNC."""
 
 DEADLINE_SHARE: Final = 0.6

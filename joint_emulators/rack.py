@@ -8,7 +8,7 @@ SYNC latches the last finished step.
 from typing import Final, final
 
 from canopen_exo.bus.frame import Frame
-from canopen_exo.bus.node import Node, Out
+from canopen_exo.bus.node import Node, Out, PortState
 from canopen_exo.device import Device
 from canopen_exo.plan import SYNC
 from joint_emulators.drive import Drive
@@ -62,6 +62,25 @@ class Rack(Node):
                 self.wake_at = device.wake_at
         if can_id == 0 or can_id >= 0x580:  # NMT and SDO may change what the devices listen to
             self._route()
+
+    def receive_on(self, now: int, ports: list[int], frame: Frame, out: Out) -> None:
+        """A frame that only some of the drives accepted, because of an error on the bus."""
+        if frame.flags:
+            return
+        for device in self._hearing[frame.can_id]:
+            if device.port in ports:
+                device.receive(now, 0, frame, out)
+                if device.wake_at < self.wake_at:
+                    self.wake_at = device.wake_at
+        self._route()
+
+    def port_changed(self, now: int, state: PortState, out: Out) -> None:
+        """The CAN controller of one drive."""
+        for device in self.devices:
+            if device.port == state.port:
+                device.port_changed(now, state, out)
+                if device.wake_at < self.wake_at:
+                    self.wake_at = device.wake_at
 
     def _synchronise(self, now: int, hearing: list[Device], data: bytes, out: Out) -> None:
         wake_at = self.wake_at

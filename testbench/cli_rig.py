@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final, Protocol
 from testbench.errors import BenchError
 
 if TYPE_CHECKING:
+    from canopen_exo.bus.hub_core import MakeBus
     from testbench.fault_file import FaultFile
     from testbench.process import ProcessOptions
     from testbench.scenario import Scenario
@@ -102,6 +103,9 @@ def add_verbs(verbs: Verbs) -> None:
     )
     hub.add_argument("--timed", action="store_true", help="with bit time and arbitration of a real bus")
     hub.add_argument("--bitrate", type=int, default=1_000_000, metavar="N", help="with --timed (default: %(default)s)")
+    hub.add_argument("--errors", action="store_true", help="with --timed: acknowledgement, error frames, error states")
+    hub.add_argument("--bit-error-rate", type=float, metavar="R", help="with --errors: noise, flips per bit")
+    hub.add_argument("--seed", type=int, default=1, metavar="N", help="of the noise (default: %(default)s)")
     _add_supervisor(hub)
     hub.set_defaults(verb=_hub)
 
@@ -272,12 +276,26 @@ def _hub(options: argparse.Namespace) -> int:
     try:
         if options.supervisor:
             die_with(options.supervisor)
-        return hub_main(options.listen, options.timed, options.bitrate)
+        return hub_main(options.listen, options.timed, options.bitrate, _bus_maker(options))
     except BenchError as error:
         print(f"hub: {error}", file=sys.stderr)
         return USAGE
     finally:
         remove_orphaned(options.folder, options.supervisor)
+
+
+def _bus_maker(options: argparse.Namespace) -> "MakeBus | None":
+    """What makes the buses on which errors happen; None without --errors. Raises BenchError."""
+    rate = options.bit_error_rate
+    if (options.errors and not options.timed) or (rate is not None and not options.errors):
+        raise BenchError("--errors needs --timed, and --bit-error-rate needs --errors")
+    if rate is not None and not 0 < rate <= 1:
+        raise BenchError(f"--bit-error-rate {rate:g} given, allowed above 0 up to 1 per bit")
+    if not options.errors:
+        return None
+    from testbench.noisy_hub import bus_maker
+
+    return bus_maker(rate, options.seed)
 
 
 def _fault(options: argparse.Namespace) -> int:

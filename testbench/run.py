@@ -12,6 +12,7 @@ from typing import Final
 
 import numpy as np
 
+from canopen_exo.bus.frame import FLAG_ERROR
 from canopen_exo.bus.medium import Medium
 from canopen_exo.bus.node import MS, NEVER, SECOND
 from fi_gateway.injector import Injector
@@ -166,12 +167,12 @@ def record_of(rig: Rig) -> RunRecord:
 
 
 def _stats(rig: Rig, medium: Medium) -> BusStats:
-    """Frames that ended within the motion, and the share of it that they lasted."""
+    """Frames that ended within the motion, and the share of it that they lasted (error frames not counted)."""
     start = rig.controller.time_zero
     end = start + rig.params.duration_ns
     frames, busy_ns = 0, 0
     for row in rig.loop.trace:
-        if row.bus == medium.index and start < row.end_ns <= end:
+        if row.bus == medium.index and start < row.end_ns <= end and not row.frame.flags & FLAG_ERROR:
             frames += 1
             busy_ns += row.frame.bits * medium.bit_ns
     return BusStats(medium.name, frames, busy_ns / (end - start), sum(port.dropped for port in medium.ports))

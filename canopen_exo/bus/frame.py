@@ -13,6 +13,8 @@ FLAG_REMOTE: Final = 2
 FLAG_FD: Final = 4
 FLAG_BRS: Final = 8
 FLAG_ESI: Final = 16
+FLAG_ERROR: Final = 32
+"""A notice in the form of an error frame (`error_frame`): in traces and records, never queued."""
 
 _FD_SIZES: Final = (12, 16, 20, 24, 32, 48, 64)
 
@@ -25,7 +27,8 @@ _BASE_ARBITRATION: Final[list[int]] = [can_id << 21 for can_id in range(0x800)]
 class Frame:
     """One CAN frame; never changed after it is made.
 
-    can_id: 11-bit, or 29-bit with FLAG_EXTENDED. data: 0..8 bytes (up to 64 with FLAG_FD), empty for a remote frame.
+    can_id: 11-bit, or 29-bit with FLAG_EXTENDED; 0x20000000 | classes with FLAG_ERROR.
+    data: 0..8 bytes (up to 64 with FLAG_FD), empty for a remote frame.
     flags: the FLAG_ constants. dlc: as on the wire; equals len(data) unless given (remote frames, raw DLC 9..15).
     arbitration: the bits that compete for the bus, as one integer; the lower one wins.
     bits: length on the wire, stuffing and 3-bit intermission included; 0 until `measure` has worked it out.
@@ -82,7 +85,7 @@ class Frame:
         return Frame, (self.can_id, self.data, self.flags, self.dlc)
 
     def __repr__(self) -> str:
-        width = 8 if self.flags & FLAG_EXTENDED else 3
+        width = 8 if self.flags & (FLAG_EXTENDED | FLAG_ERROR) else 3
         return f"{self.can_id:0{width}X}#{'R' if self.flags & FLAG_REMOTE else self.data.hex().upper()}"
 
 
@@ -93,6 +96,13 @@ def _wire_dlc(size: int) -> int:
 def check_frame(can_id: int, data: bytes, flags: int, dlc: int) -> None:
     """Raise CanopenExoError when the parts do not make a CAN frame."""
     top = 0x1FFFFFFF if flags & FLAG_EXTENDED else 0x7FF
+    if flags & FLAG_ERROR:
+        if flags != FLAG_ERROR or len(data) != 8 or not 0x20000000 <= can_id <= 0x3FFFFFFF:
+            raise CanopenExoError(
+                f"frame: error frame {can_id:#x} with {len(data)} data bytes and flags {flags:#x} given, "
+                "allowed 0x20000000 | classes with 8 data bytes and no other flag"
+            )
+        return
     if not 0 <= can_id <= top:
         raise CanopenExoError(f"frame: CAN id {can_id:#x} given, allowed 0..{top:#x}; use FLAG_EXTENDED for 29-bit ids")
     if flags & FLAG_FD:

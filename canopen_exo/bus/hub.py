@@ -16,7 +16,7 @@ import time
 from collections.abc import Iterator
 from typing import Final, final
 
-from canopen_exo.bus.hub_core import Client, Hub, TimedBus
+from canopen_exo.bus.hub_core import Client, Hub, MakeBus, TimedBus
 from canopen_exo.bus.hub_wire import split_address
 from canopen_exo.bus.medium import Medium
 from canopen_exo.bus.node import NEVER, SECOND
@@ -81,10 +81,10 @@ def listen(host: str, port: int) -> socket.socket:
 
 @final
 class HubServer:
-    """Serves one listening socket. bitrate: bit/s of a timed hub, 0 for a fast one."""
+    """Serves one listening socket. bitrate: bit/s of a timed hub, 0 for a fast one; make_timed: see `Hub`."""
 
-    def __init__(self, listener: socket.socket, bitrate: int) -> None:
-        self.hub: Final[Hub] = Hub(bitrate)
+    def __init__(self, listener: socket.socket, bitrate: int, make_timed: MakeBus | None = None) -> None:
+        self.hub: Final[Hub] = Hub(bitrate, make_timed)
         self.clients: int = 0  # connections accepted so far
         self._listener: Final[socket.socket] = listener
         self._read_size: Final[int] = _TIMED_READ if bitrate else _FAST_READ
@@ -269,8 +269,10 @@ def report(server: HubServer) -> list[str]:
     return lines
 
 
-def hub_main(listen_on: str, timed: bool, bitrate: int) -> int:
+def hub_main(listen_on: str, timed: bool, bitrate: int, make_timed: MakeBus | None = None) -> int:
     """`exo-hil hub`: serve until SIGINT or SIGTERM. listen_on: HOST:PORT; bitrate: bit/s, of a timed hub.
+
+    make_timed: see `Hub`.
 
     Prints `listening on HOST:PORT` on stdout when clients may come; talk goes to stderr. Returns the exit code.
     """
@@ -283,7 +285,7 @@ def hub_main(listen_on: str, timed: bool, bitrate: int) -> int:
     try:
         if timed:
             Medium("hub", 0, bitrate)  # 0 would be a fast hub
-        server = HubServer(listener, bitrate if timed else 0)
+        server = HubServer(listener, bitrate if timed else 0, make_timed)
     except CanopenExoError as error:
         listener.close()
         print(error, file=sys.stderr, flush=True)

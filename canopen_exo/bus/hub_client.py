@@ -346,7 +346,7 @@ class HubChannel(Channel):
         else:
             return
         before = self._state
-        self._state = PortState(0, before.state, before.tec, before.rec, cause)
+        self._state = PortState(0, before.state, before.tec, before.rec, cause, overrun=kind == KIND_OVERRUN)
         found.append(Arrival(now, None, self._state))
 
     def _lose(self, now: int, why: str) -> None:

@@ -3,9 +3,11 @@
 A fast bus gives every frame to all other clients at once, in order of arrival. A timed bus is the emulated Medium:
 transmit queues, arbitration and exact bit times, served against the clock by absolute times, so that a late wake-up
 moves no frame. Source: docs/hub.md (records), canopen_exo/bus/medium.py (timed).
-Leaves out: acknowledgement (a client alone on its bus sends without error, as on a vcan interface), bit errors.
+Here nobody needs to acknowledge: a client alone on its bus sends without error, as on a vcan interface. `hub_errors`
+has the timed bus on which errors happen.
 """
 
+from collections.abc import Callable
 from typing import Final, final
 
 from canopen_exo.bus.frame import Frame
@@ -194,34 +196,36 @@ class FastBus(SharedBus):
             self.skipped += client.offer(stamped, frames)
 
 
-@final
 class TimedBus(SharedBus):
-    """The emulated Medium against the clock. bitrate: bit/s. lateness: delivery - end of the frame, ns."""
+    """The emulated Medium against the clock. bitrate: bit/s. lateness: delivery - end of the frame, ns.
+
+    seats: the client at each port, None where nobody is any more.
+    """
 
     def __init__(self, name: str, index: int, bitrate: int) -> None:
         super().__init__(name)
         self.medium: Final[Medium] = Medium(name, index, bitrate)
         self.lateness: Final[Lateness] = Lateness()
-        self._seats: Final[list[Client | None]] = []  # by port
+        self.seats: Final[list[Client | None]] = []
 
     def join(self, client: Client) -> None:
         """Connect a client to a port that nobody uses any more, or to a new one."""
         super().join(client)
         medium = self.medium
-        for port, seat in enumerate(self._seats):
+        for port, seat in enumerate(self.seats):
             there = medium.ports[port]
             on_the_wire = medium.end != NEVER and medium.on_wire[1] is there
             if seat is None and there.queued == 0 and not on_the_wire:
                 client.port = port
-                self._seats[port] = client
+                self.seats[port] = client
                 return
         client.port = medium.attach(Node()).number
-        self._seats.append(client)
+        self.seats.append(client)
 
     def leave(self, client: Client) -> None:
         """Disconnect a client; its frames that wait are still sent."""
         super().leave(client)
-        self._seats[client.port] = None
+        self.seats[client.port] = None
 
     def carry(self, client: Client, data: bytes, now: int) -> int:
         """Put the frames into the client's transmit queue."""
@@ -232,13 +236,14 @@ class TimedBus(SharedBus):
                 size = record_size(data, at, end)
                 if size == 0:
                     break
-                self._queue(client, data, at)
+                self.queue_frame(client, data, at)
                 at += size
         finally:
             client.tell_overflow()
         return at
 
-    def _queue(self, client: Client, data: bytes, at: int) -> None:
+    def queue_frame(self, client: Client, data: bytes, at: int) -> None:
+        """One record of a client, checked before."""
         if data[at] == KIND_FD_FRAME:
             self._reject(client, data, at, "CAN FD frame on a timed hub, which emulates classical CAN; use a fast hub")
         elif data[at + 1] & FLAG_ERROR:
@@ -267,7 +272,7 @@ class TimedBus(SharedBus):
             frame, sender = medium.on_wire
             medium.end = NEVER
             self.lateness.add(now - end)
-            self._deliver(end, frame, self._seats[sender.number])
+            self._deliver(end, frame, self.seats[sender.number])
             if medium.waiting:
                 medium.arbitrate(end)
         self.wake_at = medium.end
@@ -297,16 +302,21 @@ class TimedBus(SharedBus):
             self.skipped += sender.offer(own, 1)
 
 
+MakeBus = Callable[[str, int, int, int], SharedBus]
+
+
 @final
 class Hub:
     """All buses and what came of their clients. bitrate: bit/s of timed buses, 0: fast buses.
 
+    make_timed: makes a timed bus of a name, an index, a bit rate and the time; one on which errors happen, for example.
     realtime_offset_ns: CLOCK_REALTIME - the hub's clock, for the welcome. refused: clients refused;
     wake_at: when `wake` is to be called next.
     """
 
-    def __init__(self, bitrate: int) -> None:
+    def __init__(self, bitrate: int, make_timed: MakeBus | None = None) -> None:
         self.bitrate: Final[int] = bitrate
+        self._make_timed: Final[MakeBus | None] = make_timed
         self.buses: Final[dict[str, SharedBus]] = {}
         self.realtime_offset_ns: int = 0
         self.refused: int = 0
@@ -381,8 +391,15 @@ class Hub:
         if bus is None:
             if len(self.buses) >= MAX_BUSES:
                 raise HubRecordError(f"bus {name!r} would be one more than the {MAX_BUSES} this hub keeps; restart it")
-            bus = TimedBus(name, len(self.buses), self.bitrate) if self.bitrate else FastBus(name)
+            bus = self._make(name, now)
             self.buses[name] = bus
         bus.join(client)
         client.outbox.extend(Welcome(self.bitrate, now, now + self.realtime_offset_ns).pack())
         return bus
+
+    def _make(self, name: str, now: int) -> SharedBus:
+        if not self.bitrate:
+            return FastBus(name)
+        if self._make_timed is None:
+            return TimedBus(name, len(self.buses), self.bitrate)
+        return self._make_timed(name, len(self.buses), self.bitrate, now)

@@ -7,8 +7,8 @@ buses arbitrate. No clock is read: the same nodes give the same trace on every m
 from typing import Final, final
 
 from canopen_exo.bus.frame import Frame
-from canopen_exo.bus.medium import QUEUE_LENGTH, Medium, Port, Transmission
-from canopen_exo.bus.node import NEVER, Node, Out
+from canopen_exo.bus.medium import QUEUE_LENGTH, Medium, Port, Transmission, WireEvent, WireSink, Wiring
+from canopen_exo.bus.node import NEVER, ErrorState, Node, Out, PortState
 from canopen_exo.errors import CanopenExoError
 
 
@@ -64,15 +64,28 @@ class Loop:
             self._listen(medium)
 
     def _listen(self, medium: Medium) -> None:
-        """Who hears each sender: every node once, on the first of its ports there that is not the sender."""
+        """Who hears each sender: every node once, on the first of its ports there that is neither it nor bus-off."""
         for sender in medium.ports:
             listeners: list[tuple[Node, int, Out]] = []
             for node, out in zip(self.nodes, self.outs, strict=True):
-                for port in range(len(out.ports)):
-                    if out.ports[port].medium is medium and out.ports[port] is not sender:
-                        listeners.append((node, port, out))
-                        break
+                hearing: list[int] = []
+                deaf = False
+                for port, own in enumerate(out.ports):
+                    if own.medium is medium and own is not sender:
+                        if own.state is ErrorState.BUS_OFF:
+                            deaf = True
+                        else:
+                            hearing.append(port)
+                if hearing:
+                    listeners.append((_Part(node, hearing) if deaf else node, hearing[0], out))
             sender.listeners = listeners
+
+    def install(self, wire: Wiring, medium: Medium) -> None:
+        """Let errors happen on a medium; to be called after its nodes are connected. Its timers wake as a node's."""
+        medium.install(wire)
+        wire.sink = _Sink(self)
+        self.nodes.append(wire)
+        self.outs.append(MediumOut())
 
     def run_until(self, until: int) -> None:
         """Serve every instant up to and including `until` [ns]."""
@@ -81,7 +94,7 @@ class Loop:
         media = self.media
         ends, passed = self._ends, self._passed
         for medium in media:  # queued between two calls, or the cable was mended
-            if medium.waiting and medium.end == NEVER:
+            if (medium.waiting or medium.is_restless) and medium.end == NEVER:
                 medium.arbitrate(self.now)
         wake = self._first_wake()
         if wake < self.now:
@@ -98,6 +111,12 @@ class Loop:
                 for medium in media:
                     if medium.end == now:
                         medium.end = NEVER
+                        if medium.is_watched:
+                            wire = medium.wire
+                            if wire is not None:
+                                wire.advance(now)
+                            wake = self._first_wake()
+                            continue
                         row = medium.on_wire
                         ends.append(now)
                         passed.append(row)
@@ -111,11 +130,53 @@ class Loop:
             end = NEVER
             for medium in media:
                 if medium.end == NEVER:
-                    if not medium.waiting:
+                    if not medium.waiting and not medium.is_restless:
                         continue
                     medium.arbitrate(now)
+                    if medium.end == NEVER:  # put off, or the cable is cut
+                        wake = self._first_wake()
+                        continue
                 if medium.end < end:
                     end = medium.end
+
+    def serve(self, now: int, events: list[WireEvent]) -> None:
+        """What a Wiring says has happened: rows of the trace, frames to those who accepted them, notices."""
+        for event in events:
+            self._ends.append(now)
+            self._passed.append((event.frame, event.sender))
+            if event.state is not None:
+                self._notify(now, event.sender, event.state)
+            elif event.ports is None:
+                for node, port, out in event.sender.listeners:
+                    node.receive(now, port, event.frame, out)
+            elif event.ports:
+                self._deliver(now, event.frame, event.sender, event.ports)
+
+    def _deliver(self, now: int, frame: Frame, sender: Port, ports: list[Port]) -> None:
+        """To the nodes of these ports, each once."""
+        for node, out in zip(self.nodes, self.outs, strict=True):
+            hearing: list[int] = []
+            deaf = False
+            for number, port in enumerate(out.ports):
+                if port in ports:
+                    hearing.append(number)
+                elif port.medium is sender.medium and port is not sender:
+                    deaf = True
+            if hearing and deaf:
+                node.receive_on(now, hearing, frame, out)
+            elif hearing:
+                node.receive(now, hearing[0], frame, out)
+
+    def _notify(self, now: int, port: Port, state: PortState) -> None:
+        """Tell the node of a port, by the node's own number of it; who hears whom may have changed."""
+        for medium in self.media:
+            if medium is port.medium:
+                self._listen(medium)
+        for node, out in zip(self.nodes, self.outs, strict=True):
+            for number, own in enumerate(out.ports):
+                if own is port:
+                    notice = PortState(number, state.state, state.tec, state.rec, state.cause, state.overrun)
+                    node.port_changed(now, notice, out)
 
     def _first_end(self) -> int:
         end = NEVER
@@ -142,3 +203,28 @@ class Loop:
                         f"it is {now} ns; wake() must move wake_at on"
                     )
         return self._first_wake()
+
+
+@final
+class _Part(Node):
+    """A node of which only these ports hear, because the others are bus-off."""
+
+    def __init__(self, node: Node, ports: list[int]) -> None:
+        super().__init__()
+        self.node: Final[Node] = node
+        self.ports: Final[list[int]] = ports
+
+    def receive(self, now: int, port: int, frame: Frame, out: Out) -> None:
+        self.node.receive_on(now, self.ports, frame, out)
+        self.wake_at = self.node.wake_at
+
+
+@final
+class _Sink(WireSink):
+    """The loop as its Wirings see it."""
+
+    def __init__(self, loop: Loop) -> None:
+        self.loop: Final[Loop] = loop
+
+    def happened(self, now: int, events: list[WireEvent]) -> None:
+        self.loop.serve(now, events)

@@ -4,20 +4,27 @@ Source: ISO 11898-1: the frame with the dominant (lowest) arbitration bits wins,
 max(end of the previous frame, arrival); a frame lasts its stuffed bits and the 3-bit intermission.
 The time stamp of a frame is the end of its intermission: receivers could act 3 bit times earlier, which moves no
 arbitration, because nobody may start before the bus is idle.
-Leaves out: bit errors, error frames and fault confinement; CAN FD is refused.
-Two nodes that offer the same arbitration bits at once would see a bit error; here both frames pass one after the
-other, in the order of their arrival, and `collisions` counts it.
+By itself the bus is ideal: no error ever happens, and nobody is needed to acknowledge. With a Wiring (`wire`) frames
+can be disturbed, and everything follows from it: error frames, retransmission, error states, missing acknowledgement.
+Two nodes that offer the same arbitration bits at once see a bit error then; on the ideal bus both frames pass one after
+the other, in the order of their arrival, and `collisions` counts it.
+Leaves out: CAN FD, which is refused.
 """
 
 from typing import Final, final
 
-from canopen_exo.bus.frame import FLAG_FD, Frame
-from canopen_exo.bus.node import NEVER, SECOND, Node, Out
+from mypy_extensions import mypyc_attr
+
+from canopen_exo.bus.frame import FLAG_ERROR, FLAG_FD, Frame
+from canopen_exo.bus.node import MS, NEVER, SECOND, ErrorState, Node, Out, PortState
 from canopen_exo.errors import CanopenExoError
 
 QUEUE_LENGTH: Final = 64
 """Frames one transmit queue holds; one more is dropped and counted."""
 
+
+RESTART_NS: Final = 100 * MS
+"""From bus-off to the request to restart (assumed; a common setting of `restart-ms` of Linux)."""
 
 _NOTHING: Final = Frame(0, b"")  # on the wire of a bus that was never used
 
@@ -40,9 +47,15 @@ class Port:
     """One CAN controller on the medium. number: its place there; dropped: frames its full transmit queue refused.
 
     listeners: who hears what it sends: node, the number of the port that hears it, and what the node answers through.
+    The rest means something with a Wiring only. tec, rec, state: fault confinement; restart_ns: from bus-off to the
+    request to restart, NEVER: it stays off; is_one_shot: a disturbed frame is not sent again; lost: frames that were
+    not sent because of that or of bus-off; ready_ns: it may not send before then.
     """
 
-    __slots__ = ("dropped", "listeners", "medium", "node", "number", "waiting")
+    __slots__ = (
+        "dropped", "is_one_shot", "listeners", "lost", "medium", "node", "number", "ready_ns", "rec", "restart_ns",
+        "state", "tec", "waiting",
+    )  # fmt: skip
 
     def __init__(self, medium: "Medium", node: Node, number: int) -> None:
         self.medium: Final[Medium] = medium
@@ -50,16 +63,72 @@ class Port:
         self.number: Final[int] = number
         self.listeners: list[tuple[Node, int, Out]] = []
         self.dropped: int = 0
-        self.waiting: Final[list[tuple[Frame, Port]]] = medium.waiting
+        self.waiting: list[tuple[Frame, Port]] = medium.waiting
+        self.tec: int = 0
+        self.rec: int = 0
+        self.state: ErrorState = ErrorState.ERROR_ACTIVE
+        self.restart_ns: int = RESTART_NS
+        self.is_one_shot: bool = False
+        self.lost: int = 0
+        self.ready_ns: int = 0
 
     @property
     def queued(self) -> int:
         """Frames in its transmit queue: counted when asked for, which is rare, not kept for every frame."""
         count = 0
-        for _, sender in self.waiting:
+        for _, sender in self.medium.waiting:
             if sender is self:
                 count += 1
         return count
+
+
+@final
+class WireEvent:
+    """What a Wiring tells the loop. Of three kinds, each a row of the trace (frame, sender):
+
+    a frame that has passed, with the ports that accepted it (None: everybody who listens); an error frame that somebody
+    sent, with no ports; the new state of a port, as `state` (port number on the medium), which is then the sender.
+    """
+
+    __slots__ = ("frame", "ports", "sender", "state")
+
+    def __init__(self, frame: Frame, sender: Port, ports: list[Port] | None, state: PortState | None = None) -> None:
+        self.frame: Final[Frame] = frame
+        self.sender: Final[Port] = sender
+        self.ports: Final[list[Port] | None] = ports
+        self.state: Final[PortState | None] = state
+
+
+@mypyc_attr(allow_interpreted_subclasses=True)
+class WireSink:
+    """Where a Wiring says what happened: a loop, or a hub."""
+
+    def happened(self, now: int, events: list[WireEvent]) -> None:
+        """In this order, at `now`."""
+        raise NotImplementedError
+
+
+class Wiring(Node):
+    """What makes a medium more than ideal; it takes the place of arbitration and of the end of watched frames.
+
+    A node only for its timers. sink: set by whoever carries the frames.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.sink: WireSink = WireSink()
+
+    def start(self, now: int) -> None:
+        """The bus is idle and something waits: begin what comes next, or put it off (then `wake_at` says to when)."""
+        raise NotImplementedError
+
+    def advance(self, now: int) -> None:
+        """`Medium.end` has come while `is_watched`; sets `end` anew while there is more to come."""
+        raise NotImplementedError
+
+    def abort(self) -> None:
+        """The cable is cut: what is under way ends without a result."""
+        raise NotImplementedError
 
 
 @final
@@ -69,7 +138,9 @@ class Medium:
     end: when the frame on the wire ends, NEVER while idle. on_wire: that frame and its sender, or the last ones.
     waiting: the frames of all transmit queues, each with its sender, in the order in which they will win. Each
     controller offers its lowest arbitration bits first, so one list in order of arbitration (then of arrival) holds all
-    queues. busy_ns, frames, collisions: totals so far.
+    queues. busy_ns, frames, collisions, errors: totals so far, errors being error frames.
+    wire: what can go wrong, None: nothing. is_watched: what is on the wire ends through `wire`. is_restless: a
+    controller will send an error flag though nothing waits.
     """
 
     def __init__(self, name: str, index: int, bitrate: int) -> None:
@@ -90,6 +161,16 @@ class Medium:
         self.busy_ns: int = 0
         self.frames: int = 0
         self.collisions: int = 0
+        self.errors: int = 0
+        self.wire: Wiring | None = None
+        self.is_watched: bool = False
+        self.is_restless: bool = False
+        self._is_special: bool = False
+
+    def install(self, wire: Wiring) -> None:
+        """From now on errors can happen."""
+        self.wire = wire
+        self._is_special = True
 
     def attach(self, node: Node) -> Port:
         """A new port for `node`."""
@@ -99,8 +180,12 @@ class Medium:
 
     def queue(self, port: Port, frame: Frame) -> None:
         """Put a frame into a port's transmit queue; a full queue drops it and counts it in `Port.dropped`."""
-        if frame.flags & FLAG_FD:
-            raise CanopenExoError(f"medium {self.name!r}: CAN FD frame {frame!r} given; this bus is classical CAN")
+        if frame.flags & (FLAG_FD | FLAG_ERROR):
+            kind = "CAN FD frame" if frame.flags & FLAG_FD else "error frame"
+            raise CanopenExoError(f"medium {self.name!r}: {kind} {frame!r} given; this bus is classical CAN")
+        if port.state is ErrorState.BUS_OFF or port.state is ErrorState.DOWN:
+            port.lost += 1
+            return
         waiting = self.waiting
         at = len(waiting)
         if at >= QUEUE_LENGTH and port.queued >= QUEUE_LENGTH:
@@ -118,7 +203,9 @@ class Medium:
 
     def arbitrate(self, now: int) -> None:
         """Start the winning frame. The bus must be idle and a frame must wait; a cut bus starts nothing."""
-        if self.is_cut:
+        if self._is_special:
+            if not self.is_cut and self.wire is not None:
+                self.wire.start(now)
             return
         self.on_wire = self.waiting.pop(0)
         frame = self.on_wire[0]
@@ -132,10 +219,14 @@ class Medium:
 
     def cut(self) -> None:
         """Break the cable: the frame on the wire is lost, queues fill up, nothing passes until `mend`."""
-        self.is_cut = True
+        self.is_cut = self._is_special = True
         self.cuts += 1
         self.end = NEVER
+        self.is_watched = False
+        if self.wire is not None:
+            self.wire.abort()
 
     def mend(self) -> None:
         """Join the cable again; queued frames compete at the next instant."""
         self.is_cut = False
+        self._is_special = self.wire is not None

@@ -33,16 +33,20 @@ class ErrorState(Enum):
 
 @final
 class PortState:
-    """The only error notice to Nodes: the new state of a port with its counters and why it changed."""
+    """The only error notice to Nodes: the new state of a port with its counters and why it changed.
 
-    __slots__ = ("cause", "port", "rec", "state", "tec")
+    overrun: frames were lost on their way through the controller or its driver; the state may be as before.
+    """
 
-    def __init__(self, port: int, state: ErrorState, tec: int, rec: int, cause: str) -> None:
+    __slots__ = ("cause", "overrun", "port", "rec", "state", "tec")
+
+    def __init__(self, port: int, state: ErrorState, tec: int, rec: int, cause: str, overrun: bool = False) -> None:
         self.port: Final[int] = port
         self.state: Final[ErrorState] = state
         self.tec: Final[int] = tec
         self.rec: Final[int] = rec
         self.cause: Final[str] = cause
+        self.overrun: Final[bool] = overrun
 
 
 @mypyc_attr(allow_interpreted_subclasses=True)
@@ -66,6 +70,13 @@ class Node:
 
     def receive(self, now: int, port: int, frame: Frame, out: Out) -> None:
         """A frame ended at `now` on `port`. Must not raise whatever its bytes."""
+
+    def receive_on(self, now: int, ports: list[int], frame: Frame, out: Out) -> None:
+        """The same where only these of its ports accepted the frame, because of an error on the bus.
+
+        A fifth member: only a node that keeps its ports apart (a rack of devices) has anything to do here.
+        """
+        self.receive(now, ports[0], frame, out)
 
     def wake(self, now: int, out: Out) -> None:
         """`wake_at` is reached; `now` is that time. Must move `wake_at` on."""

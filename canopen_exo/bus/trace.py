@@ -3,8 +3,9 @@
 A trace is the list of Transmission rows in loop order, kept by the loop itself; nothing here runs per frame.
 Source of the log format: can-utils, the compact notation of `candump -L`, which `canplayer`, `log2asc` and python-can
 read: `(seconds.microseconds) channel ID#DATA`, extended ids with 8 digits, `ID#R<dlc>` for a remote frame,
-`ID##<flags><data>` for CAN FD (flags: 1 bit rate switch, 2 error state indicator).
-Leaves out: error frames, and the raw DLC 9..15 of a classical frame (readers of the format reject it); the hash has it.
+`ID##<flags><data>` for CAN FD (flags: 1 bit rate switch, 2 error state indicator), error frames with their 8-digit id
+0x20000000 | classes, as the socket gives them.
+Leaves out: the raw DLC 9..15 of a classical frame (readers of the format reject it); the hash has it.
 """
 
 import hashlib
@@ -13,7 +14,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
-from canopen_exo.bus.frame import FLAG_BRS, FLAG_ESI, FLAG_EXTENDED, FLAG_FD, FLAG_REMOTE, Frame
+from canopen_exo.bus.frame import FLAG_BRS, FLAG_ERROR, FLAG_ESI, FLAG_EXTENDED, FLAG_FD, FLAG_REMOTE, Frame
 from canopen_exo.bus.medium import Transmission
 from canopen_exo.errors import CanopenExoError
 
@@ -38,7 +39,7 @@ def trace_hash(rows: Iterable[Transmission]) -> str:
 def candump_frame(frame: Frame) -> str:
     """One frame in the compact notation: `185#0011223344556677`."""
     flags = frame.flags
-    can_id = f"{frame.can_id:08X}" if flags & FLAG_EXTENDED else f"{frame.can_id:03X}"
+    can_id = f"{frame.can_id:08X}" if flags & (FLAG_EXTENDED | FLAG_ERROR) else f"{frame.can_id:03X}"
     if flags & FLAG_FD:
         fd_flags = (1 if flags & FLAG_BRS else 0) | (2 if flags & FLAG_ESI else 0)
         return f"{can_id}##{fd_flags}{frame.data.hex().upper()}"

@@ -9,12 +9,12 @@ from hypothesis import strategies as st
 from canopen_exo.bus.frame import FLAG_EXTENDED, FLAG_FD, FLAG_REMOTE, Frame
 from canopen_exo.bus.loop import Loop
 from canopen_exo.bus.medium import Medium
-from canopen_exo.bus.node import MS, NEVER, Node, Out
+from canopen_exo.bus.node import MS, NEVER, ErrorState, Node, Out, PortState
 from canopen_exo.device import BOOT_NS, Application, Device
 from canopen_exo.eds import load_eds
 from canopen_exo.nmt import NmtState
 from canopen_exo.od import ObjectDictionary
-from canopen_exo.pdo import INVALID
+from canopen_exo.pdo import INVALID, key_of
 
 PATTERN = ObjectDictionary(load_eds())
 NODE = 5
@@ -1112,3 +1112,68 @@ def test_no_frames_make_a_device_raise_or_break_its_rules(
         assert all(frame.can_id == ANSWER for frame in sent if frame.can_id & 0x780 == 0x580)
         assert len(bench.sent) - before < 200
     bench.run(now + 2000 * MS)
+
+
+# --- the CAN controller ------------------------------------------------------------------------------------------
+
+
+def changed(bench: Bench, now: int, state: ErrorState, *, overrun: bool = False) -> None:
+    """A notice about the device's port at `now`."""
+    bench.run(now - 1)
+    bench.now = now
+    bench.device.port_changed(now, PortState(0, state, 0, 0, "test", overrun), bench)
+
+
+def test_error_passive_is_8120_until_the_controller_is_active_again() -> None:
+    """Device rules: 8120, register 11, reaction of 6007; told once, and 0000 afterwards."""
+    bench = operational()
+    changed(bench, 12 * MS, ErrorState.WARNING)
+    assert bench.emergencies() == []
+    changed(bench, 13 * MS, ErrorState.ERROR_PASSIVE)
+    changed(bench, 14 * MS, ErrorState.ERROR_PASSIVE)
+    assert bench.emergencies() == [(13 * MS, 0x8120, 0x11)]
+    assert bench.application.calls("lost") == [(13 * MS, 0x8120)]
+    changed(bench, 15 * MS, ErrorState.WARNING)
+    assert bench.emergencies()[1:] == [(15 * MS, 0x0000, 0x00)]
+
+
+def test_bus_off_acts_at_once_and_is_told_when_it_is_left() -> None:
+    """Device rules: 8140 for bus-off left; CiA 402: the reaction of 6007 belongs to bus-off itself."""
+    bench = operational()
+    changed(bench, 12 * MS, ErrorState.ERROR_PASSIVE)
+    changed(bench, 13 * MS, ErrorState.BUS_OFF)
+    assert [code for _, code, _ in bench.emergencies()] == [0x8120]
+    assert bench.application.calls("lost") == [(12 * MS, 0x8120), (13 * MS, 0x8140)]
+    changed(bench, 113 * MS, ErrorState.ERROR_ACTIVE)
+    assert bench.emergencies()[1:] == [(113 * MS, 0x8140, 0x11)]
+    assert len(bench.application.calls("lost")) == 2
+    assert bench.device.od.value(key_of(0x1003, 1)) == 0x8140
+    bench.hear(114 * MS, HEARTBEAT + 1, b"\x05")
+    assert bench.emergencies()[2:] == [(114 * MS, 0x0000, 0x00)]  # a frame came through
+
+
+def test_bus_off_changes_the_nmt_state_as_1029_says() -> None:
+    """CiA 301, object 0x1029:1: bus-off is a communication error; 0: Pre-operational if Operational."""
+    bench = operational()
+    assert bench.write(0x1029, 1, 0, 1) == 0
+    changed(bench, 12 * MS, ErrorState.BUS_OFF)
+    assert bench.device.nmt.state is NmtState.PRE_OPERATIONAL
+
+
+def test_interface_that_is_down_is_no_bus_off() -> None:
+    """Its loss is noticed by SYNC, RPDO and heartbeat."""
+    bench = operational()
+    changed(bench, 12 * MS, ErrorState.DOWN)
+    changed(bench, 13 * MS, ErrorState.ERROR_ACTIVE)
+    assert bench.emergencies() == []
+    assert bench.application.calls("lost") == []
+
+
+def test_lost_objects_are_8110_until_a_frame_comes() -> None:
+    """Device rules: overrun 8110, register 11, reaction of 6007."""
+    bench = operational()
+    changed(bench, 12 * MS, ErrorState.ERROR_ACTIVE, overrun=True)
+    assert bench.emergencies() == [(12 * MS, 0x8110, 0x11)]
+    assert bench.application.calls("lost") == [(12 * MS, 0x8110)]
+    bench.sync(14 * MS)
+    assert bench.emergencies()[1:] == [(14 * MS, 0x0000, 0x00)]

@@ -7,13 +7,14 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from canopen_exo.bus.hub import HubServer, listen
+from canopen_exo.bus.hub_core import MakeBus
 
 
 class RunningHub:
     """A hub in a thread of its own. address: HOST:PORT."""
 
-    def __init__(self, bitrate: int, port: int) -> None:
-        self.server = HubServer(listen("127.0.0.1", port), bitrate)
+    def __init__(self, bitrate: int, port: int, make_timed: MakeBus | None) -> None:
+        self.server = HubServer(listen("127.0.0.1", port), bitrate, make_timed)
         self.address = self.server.address()
         self._stop, self._wake = socket.socketpair()
         self._thread = threading.Thread(target=self._run)
@@ -38,11 +39,11 @@ StartHub = Callable[..., RunningHub]
 
 @pytest.fixture
 def start_hub() -> Iterator[StartHub]:
-    """`start_hub(bitrate=0, port=0)`: a fast hub, or a timed one with a bit rate."""
+    """`start_hub(bitrate=0, port=0)`: a fast hub, or a timed one with a bit rate; make_timed: see `Hub`."""
     running: list[RunningHub] = []
 
-    def start(bitrate: int = 0, port: int = 0) -> RunningHub:
-        running.append(RunningHub(bitrate, port))
+    def start(bitrate: int = 0, port: int = 0, make_timed: MakeBus | None = None) -> RunningHub:
+        running.append(RunningHub(bitrate, port, make_timed))
         return running[-1]
 
     yield start

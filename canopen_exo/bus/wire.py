@@ -1,0 +1,443 @@
+"""A bus on which errors happen: disturbed attempts, retransmission, error states of the ports, bus-off and restart.
+
+Source: ISO 11898-1 (Bosch CAN 2.0B), fault confinement; `controller` has the bits, `confinement` the counters.
+An attempt to send goes through the bit engine only when something disturbs it, two nodes send the same arbitration
+bits, nobody is there to acknowledge, or a controller has not come to rest after an earlier error. All others are as on
+the ideal bus, with the counters brought up to date where one is not 0.
+
+Deviations. An attempt is worked out when it starts: a frame that is queued while error frames pass waits for their end,
+as it would, but one queued within the few bits in which an undisturbed node could already start waits with the others.
+A frame is received at the end of its intermission, as everywhere in this project, also where a receiver accepts it and
+an error frame follows. What bus-off does to queued frames is what Linux does: the interface goes down, so the queue
+is emptied, and what is sent until the restart is lost (`Port.lost`).
+Of the error frames of one attempt the trace shows the first error that somebody noticed.
+"""
+
+from typing import Final, final
+
+from canopen_exo.bus.attempt import COUNT, END, ERROR, Step, steps_of
+from canopen_exo.bus.bit_engine import run, split
+from canopen_exo.bus.confinement import BUS_OFF_LIMIT, RX_SUCCESS, TX_SUCCESS, count, is_passive, state_of
+from canopen_exo.bus.controller import IDLE, OFF, SUSPEND_LENGTH, Controller
+from canopen_exo.bus.disturbance import NO_ACK, Disruption, Disturbance
+from canopen_exo.bus.error_frame import write_bus_error, write_error_frame
+from canopen_exo.bus.frame import FLAG_ERROR, FLAG_EXTENDED, FLAG_REMOTE, Frame
+from canopen_exo.bus.medium import Medium, Port, WireEvent, Wiring
+from canopen_exo.bus.node import NEVER, ErrorState, Node, Out, PortState
+from canopen_exo.bus.recovery import Recovery
+
+MARGIN: Final = 64
+"""Bits after the length of a frame that disturbances are asked about: for two error frames of the longest kind."""
+
+LIMIT: Final = 4096
+"""Bits worked out at once; a bus that is held dominant for longer goes on from there."""
+
+_LONGEST_REST: Final = 32
+"""Recessive bits after which every controller that sends nothing is at rest."""
+
+_CLOSED: Final = [(Frame(0x1FFFFFFF, b"", FLAG_EXTENDED | FLAG_REMOTE), Port(Medium("none", 0, 1), Node(), 0))]
+"""The queue of a port that is bus-off: nothing can be put behind what is in it."""
+
+
+def is_present(port: Port) -> bool:
+    """It takes part: neither bus-off nor away."""
+    return port.state is not ErrorState.BUS_OFF and port.state is not ErrorState.DOWN
+
+
+@final
+class Wire(Wiring):
+    """Errors on one medium. disturbances: what disturbs it, asked in this order; may be added to between two calls.
+
+    attempts: those that went through the bit engine.
+    """
+
+    def __init__(self, medium: Medium, disturbances: list[Disturbance]) -> None:
+        super().__init__()
+        self.medium: Final[Medium] = medium
+        self.disturbances: Final[list[Disturbance]] = disturbances
+        self.attempts: int = 0
+        self._started_ns: int = 0
+        self._steps: list[Step] = []
+        self._engaged: list[Controller] = []
+        self._unsettled: list[Controller] = []
+        self._free_ns: int = 0
+        self._recoveries: list[Recovery] = []
+        self._absent: int = 0
+        self._is_charged: bool = False
+        self._is_calm: bool = True
+        self._plan_wake(0)
+
+    # --- begin ---------------------------------------------------------------------------------------------------
+
+    def start(self, now: int) -> None:
+        """Begin the next attempt, or put it off while those who want to send have to wait."""
+        medium = self.medium
+        first: tuple[Frame, Port] | None = None
+        if self._is_calm:
+            first = medium.waiting[0]
+        else:
+            self._settle(now)
+            for offer in self._offers(now):
+                first = offer
+                break
+            if first is None and not medium.is_restless:
+                self._plan_wake(now)
+                return
+        frame: Frame | None = None
+        bits, sender = 0, -1
+        if first is not None:
+            frame, port = first
+            sender = port.number
+            bits = frame.bits
+            if bits == 0:
+                bits = frame.measure()
+        disruptions: list[Disruption] = []
+        until = now + (bits + MARGIN) * medium.bit_ns
+        for disturbance in self.disturbances:
+            disruptions.extend(disturbance.errors(now, until, medium.bit_ns, frame, sender))
+        if first is None or disruptions or self._unsettled or self._is_contested(first):
+            self._attempt(now, self._offers(now), disruptions)
+            return
+        waiting = medium.waiting
+        if waiting[0] is first:
+            waiting.pop(0)
+        else:
+            waiting.remove(first)
+        medium.on_wire = first
+        medium.frames += 1
+        medium.busy_ns += bits * medium.bit_ns
+        medium.end = now + bits * medium.bit_ns
+        medium.is_watched = self._is_charged or not self._is_calm
+
+    def _is_contested(self, first: tuple[Frame, Port]) -> bool:
+        """Nobody is there to acknowledge, or another port begins with the same arbitration bits."""
+        medium = self.medium
+        if len(medium.ports) - self._absent < 2:
+            return True
+        frame, port = first
+        for other, rival in medium.waiting:
+            if other.arbitration > frame.arbitration:
+                break
+            if rival is not port and rival.ready_ns <= port.ready_ns:
+                medium.collisions += 1
+                return True
+        return False
+
+    def _offers(self, now: int) -> list[tuple[Frame, Port]]:
+        """What each controller that may send now would send, in order of arbitration."""
+        offers: list[tuple[Frame, Port]] = []
+        seen = 0
+        for waiting in self.medium.waiting:
+            port = waiting[1]
+            if not seen >> port.number & 1:
+                seen |= 1 << port.number
+                if port.ready_ns <= now and self._is_ready(port):
+                    offers.append(waiting)
+        return offers
+
+    def _is_ready(self, port: Port) -> bool:
+        """It is at rest, or has just seen the SOF of somebody else."""
+        for controller in self._unsettled:
+            if port.number in controller.ports:
+                return controller.may_join
+        return True
+
+    def _settle(self, now: int) -> None:
+        """The bus was idle until `now`: what came of it for those who had to wait for that."""
+        bit_ns = self.medium.bit_ns
+        for recovery in self._recoveries:
+            recovery.count(self._free_ns, now, bit_ns)
+        idle = min((now - self._free_ns) // bit_ns, _LONGEST_REST)
+        unsettled: list[Controller] = []
+        for controller in self._unsettled:
+            for _ in range(idle):
+                controller.step(-1, 1)
+            if controller.state != IDLE:
+                unsettled.append(controller)
+        self._unsettled = unsettled
+        calm = not unsettled and not self._recoveries
+        for port in self.medium.ports:
+            calm = calm and port.ready_ns <= now
+        self._is_calm = calm
+
+    # --- an attempt that the bit engine works out ------------------------------------------------------------------
+
+    def _attempt(self, now: int, offers: list[tuple[Frame, Port]], disruptions: list[Disruption]) -> None:
+        medium = self.medium
+        controllers = split(self._controllers(offers), disruptions)
+        bits = run(controllers, disruptions, LIMIT)
+        self.attempts += 1
+        self._engaged = controllers
+        self._started_ns = now
+        steps = steps_of(controllers, bits, medium.ports)
+        self._steps = steps
+        if offers:
+            medium.on_wire = offers[0]
+        medium.busy_ns += bits * medium.bit_ns
+        medium.is_watched = True
+        medium.is_restless = False
+        medium.end = self._time(steps[0])
+
+    def _controllers(self, offers: list[tuple[Frame, Port]]) -> list[Controller]:
+        """Senders first, then receivers; those that have not come to rest go on from where they were."""
+        controllers: list[Controller] = []
+        known = 0
+        sending = 0
+        for _, port in offers:
+            sending |= 1 << port.number
+        for controller in self._unsettled:
+            others = [number for number in controller.ports if not sending >> number & 1]
+            if others:
+                controllers.append(controller.part(others))
+            for number in controller.ports:
+                known |= 1 << number
+        for frame, port in offers:
+            sender = Controller([port.number], port.tec, port.rec)
+            for controller in self._unsettled:
+                if port.number in controller.ports:
+                    sender = controller.part([port.number])
+            sender.send(frame)
+            controllers.insert(0, sender)
+            known |= 1 << port.number
+        alike: dict[tuple[int, int], list[int]] = {}
+        for port in self.medium.ports:
+            if not known >> port.number & 1 and is_present(port):
+                alike.setdefault((port.tec, port.rec), []).append(port.number)
+        for counters, numbers in alike.items():
+            controllers.append(Controller(numbers, counters[0], counters[1]))
+        return controllers
+
+    def _time(self, step: Step) -> int:
+        return self._started_ns + (step.at + 1) * self.medium.bit_ns
+
+    # --- what comes of it ------------------------------------------------------------------------------------------
+
+    def advance(self, now: int) -> None:
+        """What has happened by `now`."""
+        medium = self.medium
+        events: list[WireEvent] = []
+        if not self._steps:
+            self._passed(now, events)
+        while self._steps and self._time(self._steps[0]) <= now:
+            step = self._steps.pop(0)
+            if step.kind == COUNT:
+                self._count(now, step.port, step.tec, step.rec, events)
+            elif step.kind == ERROR and step.error is not None:
+                medium.errors += 1
+                can_id, data = write_bus_error(step.error)
+                events.append(WireEvent(Frame(can_id, data, FLAG_ERROR), step.port, []))
+            elif step.frame is not None:
+                medium.frames += 1
+                events.append(WireEvent(step.frame, step.port, step.ports))
+            elif step.kind == END:
+                self._ended(now)
+        if self._steps:
+            medium.end = self._time(self._steps[0])
+        else:
+            medium.is_watched = False
+            self._free_ns = now
+            self._finish_recoveries(now, events)
+            self._plan_wake(now)
+        self.sink.happened(now, events)
+
+    def _passed(self, now: int, events: list[WireEvent]) -> None:
+        """A frame has passed undisturbed: the counters fall."""
+        medium = self.medium
+        frame, sender = medium.on_wire
+        for port in medium.ports:
+            if port is sender:
+                if port.tec:
+                    tec, rec = count(TX_SUCCESS, port.tec, port.rec)
+                    self._count(now, port, tec, rec, events)
+                if is_passive(port.tec, port.rec):
+                    port.ready_ns = now + SUSPEND_LENGTH * medium.bit_ns
+                    self._is_calm = False
+            elif port.rec and is_present(port):
+                tec, rec = count(RX_SUCCESS, port.tec, port.rec)
+                self._count(now, port, tec, rec, events)
+        self._weigh()
+        events.append(WireEvent(frame, sender, None))
+
+    def _ended(self, now: int) -> None:
+        """The attempt is over: frames that were sent leave their queues, the others stay."""
+        medium = self.medium
+        unsettled: list[Controller] = []
+        for controller in self._engaged:
+            port = medium.ports[controller.ports[0]]
+            frame = controller.frame
+            if frame is not None and controller.sent_at >= 0:
+                self._forget(frame, port)
+            elif frame is not None and controller.has_failed and port.is_one_shot and self._forget(frame, port):
+                port.lost += 1
+            rest = 0
+            if controller.state != IDLE and controller.state != OFF:
+                unsettled.append(controller.part(controller.ports))
+                rest = controller.idle_in
+                medium.is_restless = medium.is_restless or controller.will_drive
+            if controller.suspends or (rest and controller.transmitter and is_passive(controller.tec, controller.rec)):
+                rest += SUSPEND_LENGTH
+            for number in controller.ports:
+                medium.ports[number].ready_ns = now + rest * medium.bit_ns
+        if len(unsettled) == len(self._engaged):  # LIMIT: nobody has come to rest
+            medium.is_restless = True
+        self._unsettled = unsettled
+        self._engaged = []
+        self._is_calm = False
+        self._weigh()
+
+    def _forget(self, frame: Frame, port: Port) -> bool:
+        """Take a frame out of the queue; False when it is no longer there."""
+        waiting = self.medium.waiting
+        for at, (other, owner) in enumerate(waiting):
+            if other is frame and owner is port:
+                del waiting[at]
+                return True
+        return False
+
+    def _weigh(self) -> None:
+        """Whether any counter is above 0."""
+        self._is_charged = False
+        for port in self.medium.ports:
+            if port.tec or port.rec:
+                self._is_charged = True
+                return
+
+    # --- error states ----------------------------------------------------------------------------------------------
+
+    def _count(self, now: int, port: Port, tec: int, rec: int, events: list[WireEvent]) -> None:
+        """New counters of a port, and what follows from them."""
+        cause = "transmit errors" if tec > port.tec else "receive errors" if rec > port.rec else "frames without error"
+        port.tec, port.rec = tec, rec
+        state = state_of(tec, rec)
+        if state is not port.state and is_present(port):
+            self._change(port, state, cause, events)
+            if state is ErrorState.BUS_OFF:
+                self._go_off(now, port)
+
+    def _change(self, port: Port, state: ErrorState, cause: str, events: list[WireEvent]) -> None:
+        restarted = port.state is ErrorState.BUS_OFF
+        port.state = state
+        notice = PortState(port.number, state, port.tec, port.rec, cause)
+        can_id, data = write_error_frame(notice, restarted)
+        events.append(WireEvent(Frame(can_id, data, FLAG_ERROR), port, [], notice))
+
+    def _go_off(self, now: int, port: Port) -> None:
+        """Bus-off: nothing is sent or received until the restart; what waits is lost."""
+        self._close(port)
+        if port.restart_ns != NEVER:
+            self._recoveries.append(Recovery(port, now + port.restart_ns))
+
+    @property
+    def is_plain(self) -> bool:
+        """What is on the wire, if anything, is not worked out by the bit engine."""
+        return not self._steps
+
+    @staticmethod
+    def hears(port: Port) -> bool:
+        """It takes part in the bus."""
+        return is_present(port)
+
+    def reconsider(self) -> None:
+        """Counters or states of ports were set from outside."""
+        self._weigh()
+        self._is_calm = False
+
+    def switch_off(self, now: int, port: Port) -> None:
+        """Make a port bus-off, whatever its counters; it restarts as from any bus-off."""
+        if is_present(port):
+            events: list[WireEvent] = []
+            port.tec = BUS_OFF_LIMIT
+            self._change(port, ErrorState.BUS_OFF, "switched off", events)
+            self._go_off(now, port)
+            self.medium.is_watched = self.medium.end != NEVER
+            self._plan_wake(now)
+            self.sink.happened(now, events)
+
+    def disconnect(self, now: int, port: Port) -> None:
+        """Its node is unplugged: what waits is lost, and nobody acknowledges there any more."""
+        if is_present(port):
+            self._close(port)
+        self._recoveries = [one for one in self._recoveries if one.port is not port]
+        port.state = ErrorState.DOWN
+        self._plan_wake(now)
+
+    def connect(self, now: int, port: Port) -> None:
+        """A node is plugged in where one was unplugged."""
+        if port.state is ErrorState.DOWN:
+            self._open(now, port)
+            port.state = ErrorState.ERROR_ACTIVE
+
+    def _close(self, port: Port) -> None:
+        waiting = self.medium.waiting
+        kept = [entry for entry in waiting if entry[1] is not port]
+        port.lost += len(waiting) - len(kept)
+        waiting[:] = kept
+        port.waiting = _CLOSED
+        self._absent += 1
+        self._is_calm = False
+
+    def _open(self, now: int, port: Port) -> None:
+        port.tec = port.rec = 0
+        port.ready_ns = now
+        port.waiting = self.medium.waiting
+        self._absent -= 1
+
+    def _finish_recoveries(self, now: int, events: list[WireEvent]) -> None:
+        """Restart the ports that have seen enough recessive bits; the bus is idle."""
+        bit_ns = self.medium.bit_ns
+        left: list[Recovery] = []
+        for recovery in self._recoveries:
+            if recovery.done_ns(self._free_ns, bit_ns) > now:
+                left.append(recovery)
+                continue
+            port = recovery.port
+            self._open(now, port)
+            self._change(port, ErrorState.ERROR_ACTIVE, "controller restarted", events)
+        self._recoveries = left
+
+    # --- timers ----------------------------------------------------------------------------------------------------
+
+    def wake(self, now: int, out: Out) -> None:
+        """A port leaves bus-off, a frame was put off until now, or something disturbs an idle bus."""
+        medium = self.medium
+        events: list[WireEvent] = []
+        if medium.end == NEVER:
+            self._finish_recoveries(now, events)
+            if not medium.waiting and not medium.is_restless and not medium.is_cut:
+                self._disturb(now)
+        self._plan_wake(now)
+        if events:
+            self.sink.happened(now, events)
+
+    def _disturb(self, now: int) -> None:
+        """Nothing is sent, but something may be seen."""
+        bit_ns = self.medium.bit_ns
+        disruptions: list[Disruption] = []
+        for disturbance in self.disturbances:
+            disruptions.extend(disturbance.errors(now, now + MARGIN * bit_ns, bit_ns, None, -1))
+        for disruption in disruptions:
+            if disruption.kind != NO_ACK and len(self.medium.ports) > self._absent:
+                self._settle(now)
+                self._attempt(now, [], disruptions)
+                return
+
+    def _plan_wake(self, now: int) -> None:
+        medium = self.medium
+        at = NEVER
+        if medium.end == NEVER:
+            for recovery in self._recoveries:
+                at = min(at, recovery.done_ns(self._free_ns, medium.bit_ns))
+            if not self._is_calm:
+                for _, port in medium.waiting:
+                    at = min(at, port.ready_ns if port.ready_ns > now else NEVER)
+        after = now + 1 if medium.end == NEVER else medium.end
+        for disturbance in self.disturbances:
+            at = min(at, disturbance.next_ns(after))
+        self.wake_at = at if at > now else now + 1
+
+    def abort(self) -> None:
+        """The attempt under way leads to nothing more; who had not come to rest does so while the bus is cut."""
+        self._steps = []
+        self._engaged = []
+        self._unsettled = []
+        self.medium.is_restless = False

@@ -1,0 +1,318 @@
+"""Faults below the payload: bits, acknowledgement, error states. They need the emulated medium with a Wire on it.
+
+A frame that these faults hit is noticed as wrong by its receivers or its sender and sent again, so they cost time, not
+data. The exception is real: of errors that only some receivers see, some double ones leave a valid CRC. (A payload that
+is wrong because a sensor, a memory or a program is, models something upstream of the CAN controller: that is made by
+the faults of a gateway.)
+Every fault acts from `begin` to `end`. Ports are numbers on the medium.
+Sources: ISO 11898-1 for what the bits are; E. N. Gilbert, "Capacity of a burst-noise channel", Bell System Technical
+Journal 39 (1960), and E. O. Elliott, ibid. 42 (1963), for bursts.
+"""
+
+from typing import Final, final
+
+import numpy as np
+
+from canopen_exo.bus.bit_stream import FIELDS, field_positions
+from canopen_exo.bus.disturbance import ALL, DOMINANT, FLIP, NO_ACK, Disruption, Disturbance
+from canopen_exo.bus.frame import Frame
+from canopen_exo.bus.medium import Port
+from canopen_exo.bus.node import NEVER, Node, Out
+from canopen_exo.bus.wire import Wire
+from fi_gateway.errors import FaultError
+
+NEEDS: Final = "medium"
+"""What these faults need; a gateway between two buses cannot make them."""
+
+
+class WireFault(Disturbance):
+    """A disturbance with a window [since, until), ns."""
+
+    def __init__(self) -> None:
+        self.since: int = NEVER
+        self.until: int = NEVER
+
+    def begin(self, now: int, until: int = NEVER) -> None:
+        """Act from `now` on, and no longer from `until` on (NEVER: not known yet)."""
+        self.since, self.until = now, until
+
+    def end(self, now: int) -> None:
+        """Act no longer from `now` on."""
+        self.until = min(self.until, now)
+
+    def acts(self, now: int) -> bool:
+        """Whether the window is open."""
+        return self.since <= now < self.until
+
+
+def mask_of(ports: list[int]) -> int:
+    """Port numbers as a mask."""
+    mask = 0
+    for port in ports:
+        if port < 0:
+            raise FaultError(f"wire fault: port {port} given, allowed 0 and more")
+        mask |= 1 << port
+    return mask
+
+
+@final
+class BitError(WireFault):
+    """One bit of a frame is seen inverted: bit' = 1 - bit.
+
+    field: one of `FIELDS`; bit: its index there, from 0, stuff bits not counted; receivers: mask of those who see it
+    (also the sender, if its port is in it); cob_ids: of the frames it hits, empty for all; attempts: how many attempts
+    it hits, 0 for all (an automatic retransmission is an attempt of its own).
+    EN 50159: corruption, detected by the CAN controller, so it appears as a delay, or as a loss. FIBlock: none.
+    """
+
+    def __init__(self, field: str, bit: int, receivers: int = ALL, cob_ids: tuple[int, ...] = (), attempts: int = 1):
+        super().__init__()
+        if field not in FIELDS:
+            raise FaultError(f"bit_error: field {field!r} given, allowed {', '.join(FIELDS)}")
+        if bit < 0 or attempts < 0:
+            raise FaultError(f"bit_error: bit {bit} and attempts {attempts} given, allowed 0 and more")
+        self.field: Final[str] = field
+        self.bit: Final[int] = bit
+        self.receivers: Final[int] = receivers
+        self.cob_ids: Final[tuple[int, ...]] = cob_ids
+        self.attempts: Final[int] = attempts
+        self.hits: int = 0
+
+    def begin(self, now: int, until: int = NEVER) -> None:
+        """A new window, with all its attempts."""
+        super().begin(now, until)
+        self.hits = 0
+
+    def errors(self, now: int, until: int, bit_ns: int, frame: Frame | None, sender: int) -> list[Disruption]:
+        """The bit of this frame, if it is one of those."""
+        if not self.acts(now) or frame is None or (self.attempts and self.hits >= self.attempts):
+            return []
+        if self.cob_ids and (frame.flags or frame.can_id not in self.cob_ids):
+            return []
+        positions = field_positions(frame, self.field)
+        if self.bit >= len(positions):
+            return []
+        self.hits += 1
+        at = positions[self.bit]
+        return [Disruption(FLIP, at, at + 1, self.receivers)]
+
+
+@final
+class StuckDominant(WireFault):
+    """The bus is dominant, whoever sends what: bit' = 0. A short circuit, or a transceiver that does not let go.
+
+    EN 50159: loss (of everything). FIBlock: none.
+    """
+
+    def errors(self, now: int, until: int, bit_ns: int, frame: Frame | None, sender: int) -> list[Disruption]:
+        """All bits within the window."""
+        if until <= self.since or now >= self.until:
+            return []
+        first = max(self.since - now, 0) // bit_ns
+        end = (min(self.until, now + (1 << 40)) - now + bit_ns - 1) // bit_ns
+        return [Disruption(DOMINANT, first, end)]
+
+    def next_ns(self, after: int) -> int:
+        """All the time."""
+        if after >= self.until:
+            return NEVER
+        return max(after, self.since)
+
+
+@final
+class NoAck(WireFault):
+    """These receivers do not acknowledge (mask, ALL: nobody does): ACK slot recessive unless another one answers.
+
+    EN 50159: none by itself; the sender repeats, and becomes error-passive. FIBlock: none.
+    """
+
+    def __init__(self, receivers: int = ALL) -> None:
+        super().__init__()
+        self.receivers: Final[int] = receivers
+
+    def errors(self, now: int, until: int, bit_ns: int, frame: Frame | None, sender: int) -> list[Disruption]:
+        """For every frame."""
+        if frame is None or not self.acts(now):
+            return []
+        return [Disruption(NO_ACK, 0, 1, self.receivers)]
+
+
+class Noise(WireFault):
+    """Bits that are seen inverted at random times, on the bus's own clock, whether something is sent or not.
+
+    rng: one stream of its own. receivers: mask of those who see it. Draws are made as time goes on, a few at a time.
+    """
+
+    def __init__(self, bit_ns: int, rng: np.random.Generator, receivers: int) -> None:
+        super().__init__()
+        self.bit_ns: Final[int] = bit_ns
+        self.receivers: Final[int] = receivers
+        self._rng: Final[np.random.Generator] = rng
+        self._flips: list[int] = []
+        self._known_ns: int = 0
+
+    def begin(self, now: int, until: int = NEVER) -> None:
+        """Noise begins: what was drawn for another time does not count."""
+        super().begin(now, until)
+        self._flips = []
+        self._known_ns = now
+
+    def errors(self, now: int, until: int, bit_ns: int, frame: Frame | None, sender: int) -> list[Disruption]:
+        """The bits that are hit."""
+        if until <= self.since or now >= self.until:
+            return []
+        while self._known_ns < until:
+            self._draw()
+        flips = self._flips
+        while flips and flips[0] < now:
+            flips.pop(0)
+        found: list[Disruption] = []
+        for at in flips:
+            if at >= until or at >= self.until:
+                break
+            bit = (at - now) // bit_ns
+            found.append(Disruption(FLIP, bit, bit + 1, self.receivers))
+        return found
+
+    def next_ns(self, after: int) -> int:
+        """The next bit that is hit."""
+        if self.since == NEVER:
+            return NEVER
+        flips = self._flips
+        while flips and flips[0] < after:
+            flips.pop(0)
+        while not flips and self._known_ns < self.until:
+            self._draw()
+            while flips and flips[0] < after:
+                flips.pop(0)
+        return flips[0] if flips and flips[0] < self.until else NEVER
+
+    def _draw(self) -> None:
+        """Move `_known_ns` on, with the flips up to there."""
+        raise NotImplementedError
+
+    def _gap(self, rate: float) -> int:
+        """Time to the next event of a rate per bit, ns: geometric, at least one bit."""
+        return int(self._rng.geometric(rate)) * self.bit_ns
+
+
+@final
+class BitErrorRate(Noise):
+    """Every bit is inverted with the same small probability `rate`, independently of the others: P(flip) = rate.
+
+    EN 50159: corruption, see BitError. FIBlock: none.
+    """
+
+    def __init__(self, rate: float, bit_ns: int, rng: np.random.Generator, receivers: int = ALL) -> None:
+        super().__init__(bit_ns, rng, receivers)
+        _check("ber", "rate", rate)
+        self.rate: Final[float] = rate
+
+    def _draw(self) -> None:
+        self._known_ns += self._gap(self.rate)
+        self._flips.append(self._known_ns)
+
+
+@final
+class GilbertElliott(Noise):
+    """Noise in bursts: a two-state Markov chain, one step a bit.
+
+    good -> bad with probability `enter`, bad -> good with `leave`; a bit is inverted with probability `rate_good` or
+    `rate_bad`. A share enter / (enter + leave) of the bits is bad, a burst lasts 1 / leave bits on average.
+    EN 50159: corruption, see BitError. FIBlock: none (its packet loss in bursts is the gateway's).
+    """
+
+    def __init__(
+        self, enter: float, leave: float, rate_good: float, rate_bad: float, bit_ns: int, rng: np.random.Generator,
+        receivers: int = ALL,
+    ) -> None:  # fmt: skip
+        super().__init__(bit_ns, rng, receivers)
+        _check("gilbert_elliott", "enter", enter)
+        _check("gilbert_elliott", "leave", leave)
+        for name, rate in (("rate_good", rate_good), ("rate_bad", rate_bad)):
+            if not 0 <= rate <= 1:
+                raise FaultError(f"gilbert_elliott: {name} {rate:g} given, allowed 0..1 per bit")
+        self.enter: Final[float] = enter
+        self.leave: Final[float] = leave
+        self.rate_good: Final[float] = rate_good
+        self.rate_bad: Final[float] = rate_bad
+        self._is_bad: bool = False
+        self._change_ns: int = 0
+
+    def begin(self, now: int, until: int = NEVER) -> None:
+        """Noise begins, in the good state."""
+        super().begin(now, until)
+        self._is_bad = False
+        self._change_ns = now + self._gap(self.enter)
+
+    def _draw(self) -> None:
+        rate = self.rate_bad if self._is_bad else self.rate_good
+        at = self._known_ns + self._gap(rate) if rate else NEVER
+        if at < self._change_ns:
+            self._known_ns = at
+            self._flips.append(at)
+            return
+        self._known_ns = self._change_ns  # the rest of the gap is drawn anew: it has no memory
+        self._is_bad = not self._is_bad
+        self._change_ns += self._gap(self.leave if self._is_bad else self.enter)
+
+
+@final
+class BusOff:
+    """A controller goes bus-off, whatever its counters: TEC = 256. It restarts as its port is set to.
+
+    EN 50159: loss (of everything from and to that node, and of what waits in its queue). FIBlock: none.
+    """
+
+    def __init__(self, wire: Wire, port: Port) -> None:
+        self.wire: Final[Wire] = wire
+        self.port: Final[Port] = port
+
+    def begin(self, now: int) -> None:
+        """Now; a frame that is on the wire ends first."""
+        self.wire.switch_off(now, self.port)
+
+
+@final
+class BabblingIdiot(Node):
+    """A node that wants to send the same frame all the time: whenever its last one has left the queue, the next.
+
+    With id 0 nobody else gets the bus. EN 50159: insertion, delay of everything below it. FIBlock: none.
+    medium_port: its port, known after it was connected.
+    """
+
+    def __init__(self, frame: Frame, bit_ns: int) -> None:
+        super().__init__()
+        self.frame: Final[Frame] = frame
+        self.medium_port: Port | None = None
+        self._bit_ns: Final[int] = bit_ns
+        self._until: int = NEVER
+
+    def begin(self, now: int, until: int = NEVER) -> None:
+        """Babble from `now` on until `until`; takes effect when the loop next wakes a node."""
+        self.wake_at, self._until = now, until
+
+    def end(self, now: int) -> None:
+        """Fall silent; what is in the queue still goes."""
+        self._until = min(self._until, now)
+
+    def wake(self, now: int, out: Out) -> None:
+        """Have one frame in the queue at any time."""
+        if now >= self._until:
+            self.wake_at = NEVER
+            return
+        port = self.medium_port
+        if port is None:
+            raise FaultError("babbling_idiot: its port is not known; set medium_port after connecting it to the loop")
+        if port.queued == 0:
+            out.send(0, self.frame)
+        self.wake_at = now + _SHORTEST_FRAME * self._bit_ns
+
+
+_SHORTEST_FRAME: Final = 47
+"""Bits of an empty frame without stuff bits: in that time at most one of its frames can leave the queue."""
+
+
+def _check(fault: str, name: str, rate: float) -> None:
+    if not 0 < rate <= 1:
+        raise FaultError(f"{fault}: {name} {rate:g} given, allowed above 0 up to 1 per bit")

@@ -1,0 +1,299 @@
+"""Faults on the bits of an emulated bus: windows, what they hit, and the statistics of noise."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from canopen_exo.bus.bit_stream import field_positions
+from canopen_exo.bus.disturbance import DOMINANT, FLIP, NO_ACK
+from canopen_exo.bus.frame import Frame
+from canopen_exo.bus.loop import Loop
+from canopen_exo.bus.medium import Medium
+from canopen_exo.bus.node import MS, NEVER, ErrorState, Node, Out
+from canopen_exo.bus.trace import trace_hash
+from canopen_exo.bus.wire import Wire
+from fi_gateway.errors import FaultError
+from fi_gateway.wire_faults import (
+    BabblingIdiot,
+    BitError,
+    BitErrorRate,
+    BusOff,
+    GilbertElliott,
+    NoAck,
+    Noise,
+    StuckDominant,
+    WireFault,
+    mask_of,
+)
+
+BIT = 1000
+FRAME = Frame(0x181, bytes(8))
+SPAN = FRAME.measure() * BIT
+
+
+class Ticker(Node):
+    """Sends the same frame every period, and counts what it hears."""
+
+    def __init__(self, period_ns: int = 0) -> None:
+        super().__init__()
+        self.period_ns = period_ns
+        self.heard = 0
+        self.wake_at = 0 if period_ns else NEVER
+
+    def receive(self, now: int, port: int, frame: Frame, out: Out) -> None:
+        self.heard += frame == FRAME
+
+    def wake(self, now: int, out: Out) -> None:
+        out.send(0, FRAME)
+        self.wake_at = now + self.period_ns
+
+
+def bus_of(nodes: list[Node], faults: list[WireFault]) -> tuple[Loop, Medium, Wire]:
+    medium = Medium("bus", 0, 1_000_000)
+    loop = Loop([medium])
+    for node in nodes:
+        loop.connect(node, [medium])
+    wire = Wire(medium, list(faults))
+    loop.install(wire, medium)
+    return loop, medium, wire
+
+
+def errors(fault: WireFault, now: int, frame: Frame | None = FRAME) -> list[tuple[int, int, int, int]]:
+    found = fault.errors(now, now + SPAN, BIT, frame, 0)
+    return [(one.kind, one.first, one.end, one.ports) for one in found]
+
+
+def rng(seed: int = 1) -> np.random.Generator:
+    return np.random.default_rng(seed)
+
+
+# --- windows --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("fault", [BitError("data", 0, attempts=0), NoAck(), StuckDominant()])
+def test_fault_acts_from_begin_to_end_only(fault: WireFault) -> None:
+    """[t0, t0 + D): nothing before, nothing at the end."""
+    assert errors(fault, 0) == []
+    fault.begin(10 * MS, 20 * MS)
+    assert errors(fault, 9 * MS) == []
+    assert errors(fault, 10 * MS) != []
+    assert errors(fault, 20 * MS - 1) != []
+    assert errors(fault, 20 * MS) == []
+    fault.begin(30 * MS)
+    fault.end(31 * MS)
+    assert errors(fault, 31 * MS) == []
+
+
+@pytest.mark.parametrize("noise", [BitErrorRate(0.5, BIT, rng()), GilbertElliott(0.5, 0.5, 0.5, 0.5, BIT, rng())])
+def test_noise_acts_within_its_window_only(noise: Noise) -> None:
+    """Also where the window begins or ends within a frame."""
+    assert errors(noise, 0) == []
+    assert noise.next_ns(0) == NEVER
+    noise.begin(10 * MS, 20 * MS)
+    first = errors(noise, 10 * MS - 50 * BIT)
+    assert first
+    assert all(one[1] >= 50 for one in first)
+    last = errors(noise, 20 * MS - 50 * BIT)
+    assert last
+    assert all(one[1] < 50 for one in last)
+    assert errors(noise, 20 * MS) == []
+    assert noise.next_ns(20 * MS) == NEVER
+
+
+# --- what they hit --------------------------------------------------------------------------------------------------
+
+
+def test_bit_error_hits_the_bit_of_the_field() -> None:
+    """Stuff bits are not counted; the mask says who sees it."""
+    fault = BitError("data", 12, mask_of([2, 5]), attempts=0)
+    fault.begin(0)
+    at = field_positions(FRAME, "data")[12]
+    assert errors(fault, 0) == [(FLIP, at, at + 1, 0b100100)]
+
+
+@pytest.mark.parametrize(
+    ("fault", "hit"),
+    [
+        (BitError("data", 64), False),
+        (BitError("data", 63), True),
+        (BitError("data", 0, cob_ids=(0x182,)), False),
+        (BitError("data", 0, cob_ids=(0x182, 0x181)), True),
+    ],
+)
+def test_bit_error_passes_frames_it_is_not_for(fault: BitError, hit: bool) -> None:
+    """A field that is too short, or another COB-ID."""
+    fault.begin(0)
+    assert bool(errors(fault, 0)) is hit
+    assert errors(fault, 0, None) == []
+
+
+def test_bit_error_hits_so_many_attempts() -> None:
+    """Counted anew in every window."""
+    fault = BitError("crc", 3, attempts=2)
+    fault.begin(0)
+    assert [bool(errors(fault, at)) for at in range(4)] == [True, True, False, False]
+    fault.begin(10)
+    assert errors(fault, 10) != []
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: BitError("payload", 0), "field 'payload' given, allowed sof, id"),
+        (lambda: BitError("data", -1), "bit -1"),
+        (lambda: BitErrorRate(0, BIT, rng()), "ber: rate 0 given, allowed above 0"),
+        (lambda: BitErrorRate(1.5, BIT, rng()), "ber: rate 1.5"),
+        (lambda: GilbertElliott(0, 0.1, 0, 0.5, BIT, rng()), "gilbert_elliott: enter 0"),
+        (lambda: GilbertElliott(0.1, 0.1, -1, 0.5, BIT, rng()), "gilbert_elliott: rate_good -1"),
+        (lambda: mask_of([-1]), "port -1 given"),
+    ],
+)
+def test_wrong_parameters_are_refused(make: object, message: str) -> None:
+    """What, where, got, allowed."""
+    assert callable(make)
+    with pytest.raises(FaultError, match=message):
+        make()
+
+
+def test_no_ack_and_stuck_dominant_say_who() -> None:
+    """Their disruptions."""
+    fault = NoAck(mask_of([1]))
+    fault.begin(0)
+    assert errors(fault, 0) == [(NO_ACK, 0, 1, 2)]
+    stuck = StuckDominant()
+    stuck.begin(30 * BIT, 40 * BIT)
+    assert errors(stuck, 0) == [(DOMINANT, 30, 40, -1)]
+    assert (stuck.next_ns(0), stuck.next_ns(35 * BIT), stuck.next_ns(40 * BIT)) == (30 * BIT, 35 * BIT, NEVER)
+
+
+# --- on a bus -------------------------------------------------------------------------------------------------------
+
+
+def test_stuck_dominant_bus_stops_everything_and_comes_back() -> None:
+    """All become passive, and a sender may go bus-off; then traffic goes on."""
+    fault = StuckDominant()
+    receiver = Ticker()
+    loop, medium, _ = bus_of([Ticker(MS), receiver], [fault])
+    fault.begin(5 * MS + 500_000, 15 * MS)
+    loop.run_until(15 * MS)
+    assert receiver.heard == 6
+    assert [port.state for port in medium.ports] == [ErrorState.ERROR_PASSIVE] * 2
+    loop.run_until(30 * MS)
+    assert receiver.heard == 31 - 1  # what waited is sent; the frame of this instant is under way
+
+
+def test_frame_under_way_when_the_bus_sticks_takes_its_sender_off() -> None:
+    """TEC +8 for every 8 dominant bits."""
+    fault = StuckDominant()
+    loop, medium, _ = bus_of([Ticker(MS), Ticker()], [fault])
+    fault.begin(5 * MS + 50 * BIT, 15 * MS)
+    loop.run_until(10 * MS)
+    assert [port.state for port in medium.ports] == [ErrorState.BUS_OFF, ErrorState.ERROR_PASSIVE]
+
+
+def test_bus_off_takes_one_port_off() -> None:
+    """It restarts as set."""
+    receiver = Ticker()
+    loop, medium, wire = bus_of([Ticker(MS), receiver], [])
+    medium.ports[0].restart_ns = 10 * MS
+    loop.run_until(MS // 2)
+    BusOff(wire, medium.ports[0]).begin(loop.now)
+    loop.run_until(9 * MS)
+    assert receiver.heard == 1
+    loop.run_until(30 * MS)
+    assert receiver.heard > 15
+
+
+def test_babbling_idiot_with_id_0_starves_the_others() -> None:
+    """It wins every arbitration; when it stops they go on."""
+    receiver, idiot = Ticker(), BabblingIdiot(Frame(0, b""), BIT)
+    loop, medium, _ = bus_of([Ticker(MS), receiver, idiot], [])
+    idiot.medium_port = medium.ports[2]
+    idiot.begin(5 * MS + 200 * BIT, 20 * MS)
+    loop.run_until(5 * MS + 300 * BIT)
+    before = receiver.heard
+    busy = medium.busy_ns
+    loop.run_until(20 * MS)
+    assert receiver.heard == before == 6
+    assert medium.busy_ns - busy > 0.99 * (15 * MS - 300 * BIT)
+    loop.run_until(25 * MS - 1)
+    assert receiver.heard == 25
+
+
+def test_babbling_idiot_must_know_its_port() -> None:
+    """Connected by hand."""
+    loop, _, _ = bus_of([Ticker()], [])
+    idiot = BabblingIdiot(Frame(0, b""), BIT)
+    idiot.begin(0)
+    loop.connect(idiot, loop.media)
+    with pytest.raises(FaultError, match="set medium_port"):
+        loop.run_until(MS)
+
+
+def test_noise_is_the_same_with_the_same_stream() -> None:
+    """One stream per name; the trace follows from it."""
+
+    def run(seed: int, step: int) -> str:
+        noise = BitErrorRate(1e-3, BIT, rng(seed))
+        noise.begin(0)
+        loop, _, _ = bus_of([Ticker(200 * BIT), Ticker()], [noise])
+        while loop.now < 100 * MS:
+            loop.run_until(min(loop.now + step, 100 * MS))
+        return trace_hash(loop.trace)
+
+    assert run(1, 100 * MS) == run(1, 333_333)
+    assert run(1, 100 * MS) != run(2, 100 * MS)
+
+
+def test_noise_costs_time_but_no_data() -> None:
+    """All see the same: what is received is what was sent, once, unless the last bit of EOF was hit."""
+    noise = BitErrorRate(5e-4, BIT, rng())
+    noise.begin(0)
+    receiver = Ticker()
+    loop, medium, _ = bus_of([Ticker(500 * BIT), receiver], [noise])
+    loop.run_until(1000 * MS)
+    sent = [row for row in loop.trace if not row.frame.flags]
+    assert all(row.frame == FRAME for row in sent)
+    assert medium.errors > 100
+    assert receiver.heard == len(sent) >= 2000
+
+
+# --- statistics -----------------------------------------------------------------------------------------------------
+
+
+def flips_of(noise: Noise, bits: int) -> list[int]:
+    """Bits that are hit, asked in windows of a frame."""
+    noise.begin(0)
+    found: list[int] = []
+    for now in range(0, bits * BIT, 200 * BIT):
+        found += [now // BIT + one.first for one in noise.errors(now, now + 200 * BIT, BIT, FRAME, 0)]
+    return found
+
+
+def test_bit_error_rate_is_kept() -> None:
+    """2000 expected in 2 million bits; the standard deviation is 45, five of them are allowed."""
+    flips = flips_of(BitErrorRate(1e-3, BIT, rng()), 2_000_000)
+    assert abs(len(flips) - 2000) < 5 * 45
+    assert flips == sorted(set(flips))
+
+
+def test_bursts_have_the_share_and_the_length_of_the_chain() -> None:
+    """Share of bad bits enter / (enter + leave), here 1/11 and all of them hit: 1e5 / 11 = 9091.
+
+    A burst lasts 20 bits on average, so there are about 455; five standard deviations of either are allowed (bursts:
+    5 * sqrt(455) = 107; bits: 20 * 107 and as much again for their lengths).
+    """
+    flips = flips_of(GilbertElliott(0.005, 0.05, 0.0, 1.0, BIT, rng()), 100_000)
+    bursts = 1 + sum(later - earlier > 1 for earlier, later in pairwise(flips))
+    assert abs(bursts - 455) < 107
+    assert abs(len(flips) - 9091) < 3000
+
+
+def test_next_time_is_that_of_the_next_flip() -> None:
+    """So that an idle bus is disturbed as well."""
+    noise = BitErrorRate(1e-3, BIT, rng())
+    noise.begin(0)
+    at = noise.next_ns(0)
+    assert noise.errors(at, at + BIT, BIT, None, -1)[0].first == 0
+    assert noise.next_ns(at + 1) > at
