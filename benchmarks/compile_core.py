@@ -63,6 +63,7 @@ CORE: Final = (
     "fi_gateway/faults/value.py",
     "fi_gateway/gateway.py",
     "fi_gateway/injector.py",
+    "fi_gateway/on_wire.py",
     "fi_gateway/outlet.py",
     "fi_gateway/passage.py",
     "fi_gateway/repair.py",

@@ -18,6 +18,8 @@ _STATE: Final = (
     "frames_lost",
     "frames_delayed",
     "frames_inserted",
+    "attempts_seen",
+    "attempts_disturbed",
     "saturated",
     "first_before",
     "first_after",
@@ -38,9 +40,11 @@ class Activation:
     frames_seen: target frames that reached it; frames_unfit: of those, too short to act on; frames_injected: acted on
     (a drop that spares a frame does not act on it); of those, each at most once: frames_changed: went on at once with
     other content; frames_lost; frames_delayed: went on later, changed or not, or waited behind one that did.
-    frames_inserted: further frames; saturated: values cut at the signal's range;
-    first_before, first_after: the first frame hit (first_after None: it was lost; first_before None: it was inserted
-    without one arriving).
+    frames_inserted: further frames. Of a wire fault, attempts_seen: attempts to send a target frame while the window was
+    open, a retransmission being one of its own; attempts_disturbed: those, or idle times, in which somebody noticed an
+    error, or the bus-off that it made.
+    saturated: values cut at the signal's range; first_before, first_after: the first frame hit (first_after None: it was
+    lost, or disturbed on its way; first_before None: it was inserted without one arriving).
     """
 
     def __init__(
@@ -61,14 +65,17 @@ class Activation:
         self.frames_lost: int = 0
         self.frames_delayed: int = 0
         self.frames_inserted: int = 0
+        self.attempts_seen: int = 0
+        self.attempts_disturbed: int = 0
         self.saturated: int = 0
         self.first_before: Frame | None = None
         self.first_after: Frame | None = None
 
     @property
     def manifested(self) -> int:
-        """Frames changed, lost, delayed or inserted."""
-        return self.frames_changed + self.frames_lost + self.frames_delayed + self.frames_inserted
+        """Frames changed, lost, delayed or inserted, and attempts disturbed."""
+        frames = self.frames_changed + self.frames_lost + self.frames_delayed + self.frames_inserted
+        return frames + self.attempts_disturbed
 
     def __reduce__(
         self,

@@ -9,7 +9,8 @@ from typing import Final, final
 from canopen_exo.plan import BusPlan
 from fi_gateway.boundary import dump, validate
 from fi_gateway.errors import FaultError
-from fi_gateway.gateway import Gateway
+from fi_gateway.fault_specs import WireFaultSpec
+from fi_gateway.gateway import WIRE_LATE, Gateway
 from fi_gateway.injector import Injector
 from fi_gateway.marked_yaml import Data, Document, Keys, dotted
 from fi_gateway.schema import InjectorSpec, build_injectors, check_injectors
@@ -31,6 +32,8 @@ class Additions:
     def extend(self, gateway: Gateway, name: str, given: object, now: int, at_once: bool) -> None:
         """One more in a gateway that is there, see `Gateway.add`. Raises FaultError."""
         specs = self._with(name, given)
+        if isinstance(specs[name].fault, WireFaultSpec):
+            raise FaultError(f"injector {name}: {WIRE_LATE}")
         gateway.add(build_injectors(specs, self._plan, self._seed, 0)[-1], now, at_once)
         self.specs = specs
 

@@ -34,6 +34,7 @@ from fi_gateway.activation import Activation
 from fi_gateway.errors import FaultError
 from fi_gateway.injector import Injector
 from fi_gateway.passage import COMMAND, PLAIN, SYNC_READ, Passage, Route
+from fi_gateway.wire_faults import WireWatch
 
 CONTROLLER_PORT: Final = 0
 DRIVE_PORT: Final = 1
@@ -55,6 +56,8 @@ _STATE: Final = (
 )
 """What `__reduce__` copies besides the constructor arguments; the routes are laid afresh, and what is attached stays
 with the original."""
+
+WIRE_LATE: Final = "a wire fault acts on an emulated bus, which has to know of it before the rig runs; give it then"
 
 _PROBE_NS: Final = 20 * MS
 """While a port is away: the distance of frames that are offered to it all the same."""
@@ -97,6 +100,19 @@ class CommandPort:
 
 
 @final
+class _Watch(WireWatch):
+    """What the wire fault of an injector does, told to the gateway."""
+
+    def __init__(self, gateway: "Gateway", injector: Injector) -> None:
+        self.gateway: Final[Gateway] = gateway
+        self.injector: Final[Injector] = injector
+
+    def disturbed(self, now: int, frame: Frame | None) -> None:
+        self.injector.disturb(now, frame)
+        self.gateway.attend(now)
+
+
+@final
 class Gateway(Relay):
     """Two ports: CONTROLLER_PORT and DRIVE_PORT. What comes in on one goes out on the other.
 
@@ -106,7 +122,7 @@ class Gateway(Relay):
     away, by the port they came in on; waiting: frames that go on later; notices: error notices by port; port_changes:
     those that changed a port's state; malformed: status frames too short to read. time_zero: ns, NEVER until known.
 
-    Nine public methods: four are a Node's life and its end, five are what live control is made of.
+    Ten public methods: four are a Node's life and its end, five are live control's, one is for wire faults.
     """
 
     def __init__(self, injectors: list[Injector], cycle_ns: int, passage: Passage | None = None) -> None:
@@ -129,9 +145,13 @@ class Gateway(Relay):
         self._passage: Final[Passage] = passage if passage is not None else Passage(self.injectors)
         self._from_controller: Final[list[Route | None]] = self._passage.from_controller
         self._from_drives: Final[list[Route | None]] = self._passage.from_drives
+        self._has_wire: bool = False
         for injector in injectors:
             if injector.from_power_up:
                 self._power_up = NEVER
+            if injector.wire is not None:
+                injector.wire.listen(_Watch(self, injector))
+                self._has_wire = True
         self._note_passes()
 
     @property
@@ -206,6 +226,11 @@ class Gateway(Relay):
                 injector.start(time_zero)
         self._passage.plan()
         self.wake_at = self._passage.next_ns
+
+    def attend(self, now: int) -> None:
+        """A wire fault has done something: see to it at `now` what comes of that."""
+        self._passage.attend(now)
+        self.wake_at = now
 
     def fire(self, injector: Injector, now: int) -> None:
         """Live control: open the window of an armed injector, with all that it triggers, at `now`."""
@@ -286,7 +311,7 @@ class Gateway(Relay):
         if route.watchers or passage.is_waiting:
             passage.watch(now, port, route, frame)
         left = passage.through(now, port, route.injectors, frame)
-        self.wake_at = passage.next_ns
+        self.wake_at = now if self._has_wire else passage.next_ns  # so that the loop sees what begins on a bus
         if passage.speaks:
             self._flush(now, out)
         return left

@@ -17,6 +17,7 @@ from fi_gateway.effects import Effect
 from fi_gateway.errors import FaultError
 from fi_gateway.events import Event
 from fi_gateway.faults.base import Fault
+from fi_gateway.on_wire import OnWire
 from fi_gateway.outlet import Tray
 from fi_gateway.repair import Repair
 from fi_gateway.trigger import Report, Trigger
@@ -60,6 +61,7 @@ _INJECTOR_STATE: Final = (
     "_left",
     "_port",
     "_current",
+    "_recent",
 )
 """What `__reduce__` copies besides the constructor arguments."""
 
@@ -68,21 +70,25 @@ _INJECTOR_STATE: Final = (
 class Target:
     """Which frames an injector sees: classical 11-bit data frames of these COB-IDs, in these directions.
 
-    name: what records call them, such as "right_knee.TPDO1"; a signal has its own name.
+    name: what records call them, such as "right_knee.TPDO1"; a signal has its own name. on_bus: it is a bus, which may
+    be without COB-IDs.
     """
 
-    def __init__(self, to_controller: bool, to_drives: bool, cob_ids: tuple[int, ...], name: str = "") -> None:
+    def __init__(
+        self, to_controller: bool, to_drives: bool, cob_ids: tuple[int, ...], name: str = "", on_bus: bool = False
+    ) -> None:
         if not (to_controller or to_drives):
             raise FaultError("target: no direction given, allowed: to_controller, to_drives or both")
-        if not cob_ids or min(cob_ids) < 0 or max(cob_ids) > 0x7FF:
+        if (not cob_ids and not on_bus) or min(cob_ids, default=0) < 0 or max(cob_ids, default=0) > 0x7FF:
             raise FaultError(f"target: COB-IDs {[hex(i) for i in cob_ids]} given, allowed one or more of 0x0..0x7ff")
         self.to_controller: Final[bool] = to_controller
         self.to_drives: Final[bool] = to_drives
         self.cob_ids: Final[tuple[int, ...]] = cob_ids
         self.name: Final[str] = name
+        self.on_bus: Final[bool] = on_bus
 
-    def __reduce__(self) -> tuple[type["Target"], tuple[bool, bool, tuple[int, ...], str]]:
-        return Target, (self.to_controller, self.to_drives, self.cob_ids, self.name)
+    def __reduce__(self) -> tuple[type["Target"], tuple[bool, bool, tuple[int, ...], str, bool]]:
+        return Target, (self.to_controller, self.to_drives, self.cob_ids, self.name, self.on_bus)
 
 
 @final
@@ -116,7 +122,8 @@ class Injector:
     has_news: acting has left something to be carried out; has_turned: so that windows may open or close, or the fault
     is woken at another time; has_manifested: the open window has;
     manifested_windows, ended: windows that have manifested, that are over. too_short: frames that did not hold what the
-    fault acts on.
+    fault acts on. wire: its fault, if that acts on a bus: then attempts to send are what counts, and target frames that
+    pass the gateway are left alone.
     """
 
     def __init__(
@@ -150,6 +157,7 @@ class Injector:
         self.enabled: bool = enabled
         self.from_power_up: Final[bool] = from_power_up
         self.watches_target: Final[bool] = event.watches_target
+        self.wire: Final[OnWire | None] = fault if isinstance(fault, OnWire) else None
         self.least_bytes: Final[int] = 0 if signal is None else (signal.start + signal.length + 7) // 8
         self.number: int = 0
         self.phase: Phase = INERT
@@ -182,6 +190,7 @@ class Injector:
         self._left: int = 0
         self._port: int = 0 if target.to_drives else 1
         self._current: Activation | None = None
+        self._recent: Activation | None = None
 
     @property
     def port(self) -> int:
@@ -235,6 +244,7 @@ class Injector:
         self.phase, self.next_ns, self._current = ACTIVE, opened.end_ns, opened
         self.activated += 1
         self.has_manifested = False
+        self._fault.bound(opened.end_ns)
         self.wake_ns = self._fault.wake_at
         self._left = self._effect.frames
         return opened
@@ -254,6 +264,8 @@ class Injector:
         """What becomes of a target frame that arrives at `now` while active; None: lost, or later (in the tray)."""
         current = self._current
         if current is None or now < current.start_ns:  # stamped before the window, read after it opened
+            return frame
+        if self.wire is not None:
             return frame
         current.frames_seen += 1
         fault = self._fault
@@ -310,6 +322,30 @@ class Injector:
             self._first(current, None, tray.inserted[0] if tray.inserted else tray.late[0].frame)
         self.has_news = True
 
+    def disturb(self, now: int, frame: Frame | None) -> None:
+        """Its wire fault has disturbed an attempt to send a frame (None: an idle bus), or added one.
+
+        An error may be noticed after the window has closed; it belongs to the window all the same.
+        """
+        current, wire = self._current or self._recent, self.wire
+        if current is None or wire is None:
+            return
+        is_first = current.manifested == 0
+        self.injected += 1
+        self.manifested += 1
+        if wire.adds:
+            current.frames_inserted += 1
+        else:
+            current.attempts_disturbed += 1
+        if is_first:
+            self._first(current, None if wire.adds else frame, frame if wire.adds else None)
+            self.has_manifested = self._current is not None
+        if self._left and self._current is not None:
+            self._left -= 1
+            if self._left == 0:
+                self.close(now + 1)
+                self.has_news = self.has_turned = True
+
     def count_wait(self, arrived: Frame, left: Frame) -> None:
         """A frame has to wait behind others here; one that the fault has left alone is delayed by that."""
         current = self._current
@@ -326,9 +362,13 @@ class Injector:
         current = self._current
         if current is None:
             return
+        self._fault.bound(end_ns)
         self._fault.end()
         current.end_ns = end_ns
         current.saturated = self._fault.saturated
+        if self.wire is not None:
+            current.attempts_seen = self.wire.seen
+            self._recent = current
         self._current = None
         self.has_manifested = False
         self.wake_ns = NEVER

@@ -116,6 +116,10 @@ class Passage:
                 self._release(at)
             self.plan()
 
+    def attend(self, now: int) -> None:
+        """Something has happened to an injector from outside: look at `now` what comes of it."""
+        self.windows.next_ns = self.next_ns = now
+
     def settle(self, now: int) -> None:
         """Do all that is due up to and including `now`, after something was armed, disarmed or started from outside."""
         self.plan()
@@ -269,7 +273,8 @@ class Passage:
     def _lay(self, injector: Injector) -> None:
         """The routes of one more injector."""
         self._injectors.append(injector)
-        for cob_id in sorted(set(injector.target.cob_ids)):
+        passes = injector.wire is not None and not injector.watches_target
+        for cob_id in () if passes else sorted(set(injector.target.cob_ids)):
             if injector.target.to_drives:
                 route_of(self.from_controller, cob_id).injectors.append(injector)
             if injector.target.to_controller:

@@ -5,23 +5,26 @@ Sources: the terms are FIBlock's (Fabarisov et al., ESREL 2020): fault (type), e
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
 from numpy.random import Generator
 from pydantic import Field
 
 from canopen_exo.plan import BusPlan
-from fi_gateway.boundary import Count, Flag, SpecError, SpecModel, validate
+from fi_gateway.boundary import Count, Flag, SpecError, SpecModel, tag, validate
 from fi_gateway.chain import draw_chains
 from fi_gateway.effect_specs import InfiniteSpec
 from fi_gateway.errors import FaultError
 from fi_gateway.event_specs import NeverSpec
-from fi_gateway.fault_specs import FaultChoice
+from fi_gateway.fault_specs import FaultChoice, FaultSpec, WireFaultSpec
 from fi_gateway.injector import Injector, Target, stream
 from fi_gateway.marked_yaml import Data, Keys, did_you_mean, dotted
-from fi_gateway.target import TargetSpec, resolve
+from fi_gateway.target import Place, TargetSpec, resolve, resolve_wire
 from fi_gateway.timing_specs import EffectChoice, EventChoice, Timing
 from fi_gateway.trigger_specs import RepairSpec, ReportSpec, TriggerSpec
+
+WIRE_NEEDS: Final = "a run in virtual time (`exo-hil run`) can, and noise `exo-hil hub --timed --errors`"
+"""Who can do wire faults."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +59,10 @@ class InjectorSpec(SpecModel):
     def rearms(self) -> bool | None:
         """As the engine takes it; None: as the effect says."""
         return True if self.rearm is None and (self.max_activations or 0) > 1 else self.rearm
+
+    def place(self, plan: BusPlan) -> Place:
+        """Where the fault acts; raises SpecError."""
+        return _place(self.target, self.fault, plan)
 
     def timing(self) -> Timing:
         """Event and effect together."""
@@ -117,16 +124,46 @@ def _check(parts: Mapping[str, _Parts], plan: BusPlan, report: Complain) -> None
 
 def _check_place(name: str, target: TargetSpec, part: _Parts, plan: BusPlan, report: Complain) -> None:
     try:
-        place = resolve(target, plan)
+        place = _place(target, part.fault, plan)
     except SpecError as error:
         report((name, "target", *error.keys), str(error))
         return
+    if place.wire and part.repair is not None:
+        report((name, "repair"), "a wire fault changes no payload: there is nothing to repair; leave repair out")
+        return
+    if place.wire and not place.cob_ids and part.event is not None:
+        _check_wire_event(name, part.event, plan, report)
     for key, spec in (("fault", part.fault), ("repair", part.repair)):
         try:
             if spec is not None:
                 spec.build(place)
         except FaultError as error:
             report((name, key, *_keys(error)), str(error))
+
+
+def _check_wire_event(name: str, event: EventChoice, plan: BusPlan, report: Complain) -> None:
+    try:
+        if event.build(plan, stream(0, 0, name)).watches_target:
+            text = "counts target frames as they pass the gateway; name some in the target, by pdo, kind or cob_id"
+            report((name, "event"), text)
+    except FaultError:
+        pass  # reported where the event itself is checked
+
+
+def _place(target: TargetSpec, fault: FaultSpec | None, plan: BusPlan) -> Place:
+    """Of a target on a bus when the fault is one of the wire, or, where it is not readable, when the target says so."""
+    on_wire = isinstance(fault, WireFaultSpec) if fault is not None else target.wire is not None
+    return resolve_wire(target, plan) if on_wire else resolve(target, plan)
+
+
+def refuse_wire_faults(specs: Mapping[str, InjectorSpec], what: str) -> None:
+    """Raise FaultError when there are wire faults. what: has no emulated bus, "exo-hil gateway"."""
+    for name, spec in specs.items():
+        if isinstance(spec.fault, WireFaultSpec):
+            raise FaultError(
+                f"injectors.{name}.fault: {what} cannot do {tag(type(spec.fault))}: bits, acknowledgement and error "
+                f"counters are out of its reach, they are the CAN controllers' own; {WIRE_NEEDS}"
+            )
 
 
 def _keys(error: FaultError) -> Keys:
@@ -176,7 +213,7 @@ def injector_warnings(specs: Mapping[str, InjectorSpec], plan: BusPlan, duration
     for name, spec in specs.items():
         if not spec.enabled:
             continue
-        place = resolve(spec.target, plan)
+        place = spec.place(plan)
         late = [time for time in spec.event.times() if time >= duration_ns and spec.start == "time_zero"]
         if name not in live and not late:
             silent = spec.event.silent(plan)
@@ -224,7 +261,7 @@ def describe_injectors(specs: Mapping[str, InjectorSpec], plan: BusPlan, duratio
 
 
 def _sentence(name: str, spec: InjectorSpec, plan: BusPlan, duration_ns: int) -> str:
-    place = resolve(spec.target, plan)
+    place = spec.place(plan)
     starts = []
     event = spec.timing().words(name, place, plan, duration_ns)
     if event:
@@ -262,10 +299,10 @@ def build_injectors(specs: Mapping[str, InjectorSpec], plan: BusPlan, seed: int,
 
 
 def _build(name: str, spec: InjectorSpec, plan: BusPlan, rng: Generator) -> Injector:
-    place = resolve(spec.target, plan)
+    place = spec.place(plan)
     return Injector(
         name,
-        Target(place.to_controller, place.to_drives, place.cob_ids, place.name),
+        Target(place.to_controller, place.to_drives, place.cob_ids, place.name, place.wire != ""),
         spec.fault.build(place),
         spec.event.build(plan, rng),
         spec.effect.build(plan, rng),

@@ -11,6 +11,7 @@ from typing import Annotated, Final, Literal, TypeAlias
 
 from pydantic import Field, PlainSerializer, PlainValidator, WithJsonSchema
 
+from canopen_exo.bus.node import SECOND
 from canopen_exo.plan import (
     EMCY,
     HEARTBEAT,
@@ -37,6 +38,13 @@ _ALL_BITS: Final = 0x7FF
 
 CONTROLLER: Final = "controller"
 """`node` of the controller's own heartbeat."""
+
+GATEWAY: Final = "gateway"
+WIRE_CONTROLLER: Final = "controller"
+WIRE_DRIVE: Final = "drive"
+"""`wire` of a target: the bus between high-level controller and gateway, and that between gateway and drives."""
+
+WIRE_WORDS: Final = "bit_error, stuck_dominant, no_ack, bit_error_rate, gilbert_elliott, bus_off, babbling_idiot"
 
 KINDS: Final = {
     "sdo_request": (SDO_REQUEST, TO_DRIVES, 8, "SDO request"),
@@ -113,9 +121,12 @@ class TargetSpec(SpecModel):
 
     Then which frames: node with signal or pdo, pdo alone, kind with or without node, or cob_id; and which bits in them:
     signal, bits, or all.
+    For a wire fault: the bus on which it acts (default: the drives'), and who sends what it acts on: frames as above,
+    all frames of a node, or with neither whatever is sent; a direction of travel may be given and need not.
     """
 
-    bus: Literal["to_controller", "to_drives", "both"]
+    bus: Literal["to_controller", "to_drives", "both"] | None = None
+    wire: Literal["controller", "drive"] | None = None
     node: Text | None = None
     pdo: Text | None = None
     kind: Literal["sdo_request", "sdo_answer", "emcy", "heartbeat", "sync", "nmt"] | None = None
@@ -130,6 +141,8 @@ class Place:
 
     words: for people, such as "position of right_knee (0x185, to_controller)"; name: for records, such as
     "right_knee.TPDO1"; known: whether the plan has such frames.
+    wire: the bus on which a wire fault acts, "" for other faults; nodes: on that bus, by number of their port; node:
+    the one named, "" for none; senders: ports whose frames are meant, as a mask; bit_ns: one bit.
     """
 
     to_controller: bool
@@ -140,10 +153,53 @@ class Place:
     words: str
     name: str
     known: bool = True
+    wire: str = ""
+    nodes: tuple[str, ...] = ()
+    node: str = ""
+    senders: int = -1
+    bit_ns: int = 0
+
+
+def wire_nodes(wire: str, plan: BusPlan) -> tuple[str, ...]:
+    """Who is on that bus, by number of the port."""
+    if wire == WIRE_CONTROLLER:
+        return CONTROLLER, GATEWAY
+    return GATEWAY, *(joint.name for joint in plan.joints)
+
+
+def resolve_wire(target: TargetSpec, plan: BusPlan) -> Place:
+    """The attempts to send that a wire fault's target means; raises SpecError."""
+    for key in ("signal", "bits"):
+        if getattr(target, key) is not None:
+            raise SpecError((key,), f"wire faults act on frames, not on what is in them; leave {key} out")
+    wire = target.wire or WIRE_DRIVE
+    nodes = wire_nodes(wire, plan)
+    on_bus = f"on the {wire} bus"
+    if target.pdo is None and target.kind is None and target.cob_id is None:
+        node = target.node or ""
+        if node and node not in nodes:
+            hint = did_you_mean(node, nodes)
+            raise SpecError(("node",), f"{node!r} is not {on_bus}{hint} (there are {', '.join(nodes)})")
+        words, name = (f"{node} {on_bus}", f"{node}.{wire} bus") if node else (f"the {wire} bus", f"{wire} bus")
+        place = Place(True, True, (), None, -1, words, name)
+        place = replace(place, node=node, senders=1 << nodes.index(node) if node else -1)
+    else:
+        place = resolve(replace(target, bus=target.bus or "both", wire=None), plan)
+        place = replace(place, words=f"{place.words} {on_bus}", name=f"{place.name}@{wire}", node=target.node or "")
+    if target.bus in (TO_DRIVES, TO_CONTROLLER):
+        # on both buses port 0 is the side of the controller
+        place = replace(place, senders=place.senders & (1 if target.bus == TO_DRIVES else ~1))
+        if not place.senders:
+            raise SpecError(("bus",), f"{place.words} sends nothing {target.bus}; leave bus out")
+    return replace(place, wire=wire, nodes=nodes, bit_ns=SECOND // plan.bitrate)
 
 
 def resolve(target: TargetSpec, plan: BusPlan) -> Place:
     """The frames and bits a target means; raises SpecError when there is none, more than one, or the other way."""
+    if target.wire is not None:
+        raise SpecError(("wire",), f"only wire faults ({WIRE_WORDS}) act on a bus; other faults act in the gateway")
+    if target.bus is None:
+        raise SpecError((), f"bus is missing: write {TO_CONTROLLER}, {TO_DRIVES} or both")
     if target.node is not None and not (target.node == CONTROLLER and target.kind == "heartbeat"):
         _joint(target.node, plan)
     if target.pdo is not None:

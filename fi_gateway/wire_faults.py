@@ -12,6 +12,7 @@ Journal 39 (1960), and E. O. Elliott, ibid. 42 (1963), for bursts.
 from typing import Final, final
 
 import numpy as np
+from mypy_extensions import mypyc_attr
 
 from canopen_exo.bus.bit_stream import FIELDS, field_positions
 from canopen_exo.bus.disturbance import ALL, DOMINANT, FLIP, NO_ACK, Disruption, Disturbance
@@ -25,16 +26,37 @@ NEEDS: Final = "medium"
 """What these faults need; a gateway between two buses cannot make them."""
 
 
+@mypyc_attr(allow_interpreted_subclasses=True)
+class WireWatch:
+    """Who is told what a wire fault does."""
+
+    def disturbed(self, now: int, frame: Frame | None) -> None:
+        """It has disturbed an attempt to send `frame` (None: an idle bus), or added `frame`."""
+
+
 class WireFault(Disturbance):
-    """A disturbance with a window [since, until), ns."""
+    """A disturbance with a window [since, until), ns.
+
+    seen: attempts to send a frame that it could disturb, in this window or the last one; watch: who is told.
+    """
 
     def __init__(self) -> None:
         self.since: int = NEVER
         self.until: int = NEVER
+        self.seen: int = 0
+        self.watch: WireWatch = WireWatch()
 
     def begin(self, now: int, until: int = NEVER) -> None:
         """Act from `now` on, and no longer from `until` on (NEVER: not known yet)."""
         self.since, self.until = now, until
+        self.seen = 0
+
+    def draw_from(self, rng: np.random.Generator) -> None:
+        """The stream for what it draws; for those that draw nothing, nothing."""
+
+    def disturbed(self, now: int, frame: Frame | None) -> None:
+        """Tell it on."""
+        self.watch.disturbed(now, frame)
 
     def end(self, now: int) -> None:
         """Act no longer from `now` on."""
@@ -43,6 +65,24 @@ class WireFault(Disturbance):
     def acts(self, now: int) -> bool:
         """Whether the window is open."""
         return self.since <= now < self.until
+
+
+class FrameFault(WireFault):
+    """One that acts on certain frames: with these COB-IDs (empty: any), sent by these ports (mask)."""
+
+    def __init__(self, cob_ids: tuple[int, ...], senders: int) -> None:
+        super().__init__()
+        self.cob_ids: Final[tuple[int, ...]] = cob_ids
+        self.senders: Final[int] = senders
+
+    def concerns(self, now: int, frame: Frame | None, sender: int) -> bool:
+        """Whether it may act on this attempt, which is then counted."""
+        if frame is None or not self.acts(now) or not self.senders >> sender & 1:
+            return False
+        if self.cob_ids and (frame.flags or frame.can_id not in self.cob_ids):
+            return False
+        self.seen += 1
+        return True
 
 
 def mask_of(ports: list[int]) -> int:
@@ -56,17 +96,20 @@ def mask_of(ports: list[int]) -> int:
 
 
 @final
-class BitError(WireFault):
+class BitError(FrameFault):
     """One bit of a frame is seen inverted: bit' = 1 - bit.
 
     field: one of `FIELDS`; bit: its index there, from 0, stuff bits not counted; receivers: mask of those who see it
-    (also the sender, if its port is in it); cob_ids: of the frames it hits, empty for all; attempts: how many attempts
-    it hits, 0 for all (an automatic retransmission is an attempt of its own).
+    (also the sender, if its port is in it); cob_ids, senders: of the frames it hits; attempts: how many attempts it
+    hits, 0 for all (an automatic retransmission is an attempt of its own).
     EN 50159: corruption, detected by the CAN controller, so it appears as a delay, or as a loss. FIBlock: none.
     """
 
-    def __init__(self, field: str, bit: int, receivers: int = ALL, cob_ids: tuple[int, ...] = (), attempts: int = 1):
-        super().__init__()
+    def __init__(
+        self, field: str, bit: int, receivers: int = ALL, cob_ids: tuple[int, ...] = (), attempts: int = 1,
+        senders: int = ALL,
+    ) -> None:  # fmt: skip
+        super().__init__(cob_ids, senders)
         if field not in FIELDS:
             raise FaultError(f"bit_error: field {field!r} given, allowed {', '.join(FIELDS)}")
         if bit < 0 or attempts < 0:
@@ -74,7 +117,6 @@ class BitError(WireFault):
         self.field: Final[str] = field
         self.bit: Final[int] = bit
         self.receivers: Final[int] = receivers
-        self.cob_ids: Final[tuple[int, ...]] = cob_ids
         self.attempts: Final[int] = attempts
         self.hits: int = 0
 
@@ -85,9 +127,7 @@ class BitError(WireFault):
 
     def errors(self, now: int, until: int, bit_ns: int, frame: Frame | None, sender: int) -> list[Disruption]:
         """The bit of this frame, if it is one of those."""
-        if not self.acts(now) or frame is None or (self.attempts and self.hits >= self.attempts):
-            return []
-        if self.cob_ids and (frame.flags or frame.can_id not in self.cob_ids):
+        if frame is None or not self.concerns(now, frame, sender) or (self.attempts and self.hits >= self.attempts):
             return []
         positions = field_positions(frame, self.field)
         if self.bit >= len(positions):
@@ -108,6 +148,7 @@ class StuckDominant(WireFault):
         """All bits within the window."""
         if until <= self.since or now >= self.until:
             return []
+        self.seen += 0 if frame is None else 1
         first = max(self.since - now, 0) // bit_ns
         end = (min(self.until, now + (1 << 40)) - now + bit_ns - 1) // bit_ns
         return [Disruption(DOMINANT, first, end)]
@@ -120,19 +161,19 @@ class StuckDominant(WireFault):
 
 
 @final
-class NoAck(WireFault):
+class NoAck(FrameFault):
     """These receivers do not acknowledge (mask, ALL: nobody does): ACK slot recessive unless another one answers.
 
     EN 50159: none by itself; the sender repeats, and becomes error-passive. FIBlock: none.
     """
 
-    def __init__(self, receivers: int = ALL) -> None:
-        super().__init__()
+    def __init__(self, receivers: int = ALL, cob_ids: tuple[int, ...] = (), senders: int = ALL) -> None:
+        super().__init__(cob_ids, senders)
         self.receivers: Final[int] = receivers
 
     def errors(self, now: int, until: int, bit_ns: int, frame: Frame | None, sender: int) -> list[Disruption]:
-        """For every frame."""
-        if frame is None or not self.acts(now):
+        """For every such frame."""
+        if not self.concerns(now, frame, sender):
             return []
         return [Disruption(NO_ACK, 0, 1, self.receivers)]
 
@@ -140,16 +181,21 @@ class NoAck(WireFault):
 class Noise(WireFault):
     """Bits that are seen inverted at random times, on the bus's own clock, whether something is sent or not.
 
-    rng: one stream of its own. receivers: mask of those who see it. Draws are made as time goes on, a few at a time.
+    rng: one stream of its own, given here or before `begin` (`draw_from`). receivers: mask of those who see it. Draws
+    are made as time goes on, a few at a time.
     """
 
-    def __init__(self, bit_ns: int, rng: np.random.Generator, receivers: int) -> None:
+    def __init__(self, bit_ns: int, rng: np.random.Generator | None, receivers: int) -> None:
         super().__init__()
         self.bit_ns: Final[int] = bit_ns
         self.receivers: Final[int] = receivers
-        self._rng: Final[np.random.Generator] = rng
+        self._rng: np.random.Generator | None = rng
         self._flips: list[int] = []
         self._known_ns: int = 0
+
+    def draw_from(self, rng: np.random.Generator) -> None:
+        """Its stream from now on."""
+        self._rng = rng
 
     def begin(self, now: int, until: int = NEVER) -> None:
         """Noise begins: what was drawn for another time does not count."""
@@ -161,6 +207,7 @@ class Noise(WireFault):
         """The bits that are hit."""
         if until <= self.since or now >= self.until:
             return []
+        self.seen += 0 if frame is None else 1
         while self._known_ns < until:
             self._draw()
         flips = self._flips
@@ -193,6 +240,8 @@ class Noise(WireFault):
 
     def _gap(self, rate: float) -> int:
         """Time to the next event of a rate per bit, ns: geometric, at least one bit."""
+        if self._rng is None:
+            raise FaultError("noise: it has no random stream; give rng, or call draw_from before begin")
         return int(self._rng.geometric(rate)) * self.bit_ns
 
 
@@ -203,9 +252,11 @@ class BitErrorRate(Noise):
     EN 50159: corruption, see BitError. FIBlock: none.
     """
 
-    def __init__(self, rate: float, bit_ns: int, rng: np.random.Generator, receivers: int = ALL) -> None:
+    def __init__(
+        self, rate: float, bit_ns: int, rng: np.random.Generator | None = None, receivers: int = ALL
+    ) -> None:
         super().__init__(bit_ns, rng, receivers)
-        _check("ber", "rate", rate)
+        _check("bit_error_rate", "rate", rate)
         self.rate: Final[float] = rate
 
     def _draw(self) -> None:
@@ -223,8 +274,8 @@ class GilbertElliott(Noise):
     """
 
     def __init__(
-        self, enter: float, leave: float, rate_good: float, rate_bad: float, bit_ns: int, rng: np.random.Generator,
-        receivers: int = ALL,
+        self, enter: float, leave: float, rate_good: float, rate_bad: float, bit_ns: int,
+        rng: np.random.Generator | None = None, receivers: int = ALL,
     ) -> None:  # fmt: skip
         super().__init__(bit_ns, rng, receivers)
         _check("gilbert_elliott", "enter", enter)
@@ -278,13 +329,14 @@ class BabblingIdiot(Node):
     """A node that wants to send the same frame all the time: whenever its last one has left the queue, the next.
 
     With id 0 nobody else gets the bus. EN 50159: insertion, delay of everything below it. FIBlock: none.
-    medium_port: its port, known after it was connected.
+    medium_port: its port, known after it was connected; watch: who is told of each frame.
     """
 
     def __init__(self, frame: Frame, bit_ns: int) -> None:
         super().__init__()
         self.frame: Final[Frame] = frame
         self.medium_port: Port | None = None
+        self.watch: WireWatch = WireWatch()
         self._bit_ns: Final[int] = bit_ns
         self._until: int = NEVER
 
@@ -294,7 +346,7 @@ class BabblingIdiot(Node):
 
     def end(self, now: int) -> None:
         """Fall silent; what is in the queue still goes."""
-        self._until = min(self._until, now)
+        self._until = now
 
     def wake(self, now: int, out: Out) -> None:
         """Have one frame in the queue at any time."""
@@ -306,6 +358,7 @@ class BabblingIdiot(Node):
             raise FaultError("babbling_idiot: its port is not known; set medium_port after connecting it to the loop")
         if port.queued == 0:
             out.send(0, self.frame)
+            self.watch.disturbed(now, self.frame)
         self.wake_at = now + _SHORTEST_FRAME * self._bit_ns
 
 

@@ -110,7 +110,9 @@ def _run(options: argparse.Namespace) -> int:
 
     In virtual time, or with --realtime as processes against the clock, on an own hub or on the buses named.
     """
+    from fi_gateway.errors import FaultError
     from fi_gateway.marked_yaml import FileErrors
+    from fi_gateway.schema import refuse_wire_faults
     from testbench.errors import BenchError
     from testbench.scenario import load_scenario
     from testbench.store import check_folder, default_folder, result_files, write_result
@@ -126,9 +128,10 @@ def _run(options: argparse.Namespace) -> int:
             from testbench.realtime_run import check_expectations
 
             check_expectations(scenario, frozenset(options.without))
+            refuse_wire_faults(scenario.injectors, "exo-hil run --realtime")
         folder = options.out or default_folder(scenario.name, scenario.seed, options.overrides)
         check_folder(folder)
-    except (FileErrors, BenchError) as error:
+    except (FileErrors, BenchError, FaultError) as error:
         _say(_as_typed(error, options))
         return USAGE
     for warning in scenario.warnings:

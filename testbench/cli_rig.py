@@ -323,6 +323,8 @@ def _fault(options: argparse.Namespace) -> int:
 def _up(options: argparse.Namespace) -> int:
     """Start hub, joints, gateway and controller, walk until Ctrl-C, and stop them in order."""
     from canopen_exo.errors import CanopenExoError
+    from fi_gateway.errors import FaultError
+    from fi_gateway.schema import refuse_wire_faults
     from testbench.child import ProcessError
     from testbench.live import run_up
     from testbench.supervisor import Setup
@@ -331,6 +333,8 @@ def _up(options: argparse.Namespace) -> int:
     if scenario is None:
         return USAGE
     try:
+        if not options.no_faults:
+            refuse_wire_faults(scenario.injectors, "exo-hil up")
         setup = Setup(
             scenario,
             named_buses(options),
@@ -345,6 +349,6 @@ def _up(options: argparse.Namespace) -> int:
     except ProcessError as error:
         print(error, file=sys.stderr)
         return INVALID
-    except (BenchError, CanopenExoError) as error:
+    except (BenchError, CanopenExoError, FaultError) as error:
         print(error, file=sys.stderr)
         return USAGE

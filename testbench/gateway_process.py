@@ -48,7 +48,10 @@ def gateway_main(
 ) -> int:
     """The gateway between two buses, until told to end. Raises BenchError, FaultError."""
     from fi_gateway.addition import Additions
+    from fi_gateway.schema import refuse_wire_faults
 
+    if given.faults:
+        refuse_wire_faults(faults.injectors, "exo-hil gateway")
     additions = Additions(faults.injectors if given.faults else {}, faults.plan, faults.seed)
     gateway = Gateway(additions.built(), faults.plan.cycle_ns)
     control = LiveControl(gateway, additions)

@@ -9,6 +9,7 @@ from typing import Final
 
 from canopen_exo.bus.loop import Loop
 from canopen_exo.bus.medium import Medium
+from canopen_exo.bus.wire import Wire
 from canopen_exo.device import Device
 from canopen_exo.eds import load_eds
 from canopen_exo.master import Expected, Master, SlaveConfig, Write
@@ -75,7 +76,22 @@ def build_rig(params: RigParams, injectors: list[Injector]) -> Rig:
     loop.connect(master, [controller_bus])
     loop.connect(gateway, [controller_bus, drive_bus])
     loop.connect(rack, [drive_bus] * len(plan.joints))
+    for medium in (controller_bus, drive_bus):
+        _install_wire(loop, medium, injectors)
     return Rig(params, loop, controller_bus, drive_bus, master, controller, gateway, rack)
+
+
+def _install_wire(loop: Loop, medium: Medium, injectors: list[Injector]) -> None:
+    """Let errors happen on a bus for which there are wire faults; any other one stays ideal."""
+    faults = [one.wire for one in injectors if one.wire is not None and one.wire.bus == medium.name]
+    if not faults:
+        return
+    for fault in faults:
+        fault.add_nodes(loop, medium)
+    wire = Wire(medium, [])
+    loop.install(wire, medium)
+    for fault in faults:
+        fault.attach(wire)
 
 
 def build_mechanics(params: RigParams) -> str:

@@ -46,7 +46,8 @@ class InjectionEntry(TypedDict):
 
     due_s: time drawn, given or triggered; start_s: when the window opened, later only when a value had to come first;
     duration_s: as drawn or given, None for no limit; end_s: None when its window had no end; frames: changed, lost,
-    delayed or inserted, and each of these; frames_injected: that the fault acted on, of frames_seen target frames;
+    delayed or inserted, and each of these, and attempts disturbed; attempts_*: of wire faults, to send a target frame,
+    seen and disturbed; frames_injected: that the fault acted on, of frames_seen target frames;
     frames_unfit: too short to act on; saturated: values cut at the signal's range; first_*: as in a candump log.
     """
 
@@ -64,6 +65,8 @@ class InjectionEntry(TypedDict):
     frames_injected: int
     frames_seen: int
     frames_unfit: int
+    attempts_seen: int
+    attempts_disturbed: int
     saturated: int
     signal: str
     cause: str
@@ -72,7 +75,7 @@ class InjectionEntry(TypedDict):
 
 
 class CountEntry(TypedDict):
-    """activated: windows opened; injected: frames faults acted on; manifested: changed, lost, delayed or inserted."""
+    """activated: windows opened; injected: frames, and attempts to send, that were acted on; manifested: `frames`."""
 
     activated: int
     injected: int
@@ -284,7 +287,7 @@ def versions() -> dict[str, str]:
 def _counts(activations: Sequence[Activation]) -> CountEntry:
     return {
         "activated": len(activations),
-        "injected": sum(one.frames_injected for one in activations),
+        "injected": sum(one.frames_injected + one.attempts_disturbed for one in activations),
         "manifested": sum(one.manifested for one in activations),
     }
 
@@ -305,6 +308,8 @@ def _injection(one: Activation, time0_ns: int) -> InjectionEntry:
         "frames_injected": one.frames_injected,
         "frames_seen": one.frames_seen,
         "frames_unfit": one.frames_unfit,
+        "attempts_seen": one.attempts_seen,
+        "attempts_disturbed": one.attempts_disturbed,
         "saturated": one.saturated,
         "signal": one.signal,
         "cause": one.cause,
@@ -412,17 +417,28 @@ def _injection_lines(document: Summary) -> list[str]:
     lines = []
     for one in injections:
         end = "   to the end" if one["end_s"] is None else f"..{one['end_s']:8.3f} s "
-        hit = one["frames"] - one["frames_inserted"]
         added = f", {one['frames_inserted']} inserted" if one["frames_inserted"] else ""
         cut = f", {one['saturated']} cut at the range" if one["saturated"] else ""
         lines.append(
             f"  {one['injector']:<{name}}  {one['signal'] or 'whole frame':<{signal}}  {one['start_s']:8.3f} {end}"
-            f"  {hit:5d} of {one['frames_seen']} frames {_what(one)}{added}{cut}  {one['cause']}"
+            f"  {_hit(one)}{added}{cut}  {one['cause']}"
         )
     inserted = sum(one["frames_inserted"] for one in injections)
     more = f", {inserted} inserted" if inserted else ""
-    hit = counts["manifested"] - inserted
+    disturbed = sum(one["attempts_disturbed"] for one in injections)
+    more += f", {disturbed} attempts disturbed" if disturbed else ""
+    hit = counts["manifested"] - inserted - disturbed
     return [f"injections: {counts['activated']} activated, {hit} of {seen} frames hit{more}", *lines]
+
+
+def _hit(one: InjectionEntry) -> str:
+    """How many frames, or attempts to send one, were hit."""
+    if one["attempts_seen"]:
+        return f"{one['attempts_disturbed']:5d} of {one['attempts_seen']} attempts disturbed"
+    if one["attempts_disturbed"]:
+        return f"{one['attempts_disturbed']:5d} times disturbed"
+    hit = one["frames"] - one["frames_inserted"]
+    return f"{hit:5d} of {one['frames_seen']} frames {_what(one)}"
 
 
 def _what(one: InjectionEntry) -> str:

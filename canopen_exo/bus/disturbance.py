@@ -47,6 +47,12 @@ class Disturbance:
         """
         return []
 
+    def disturbed(self, now: int, frame: Frame | None) -> None:
+        """Somebody noticed an error in an attempt to send `frame` in which it had disrupted bits (None: an idle bus).
+
+        Said once an attempt, when the first error is noticed, or a frame accepted that is not the one sent.
+        """
+
     def next_ns(self, after: int) -> int:
         """When it acts at the earliest at or after `after` [ns] on a bus on which nothing is sent."""
         return NEVER

@@ -63,6 +63,8 @@ class Wire(Wiring):
         self._free_ns: int = 0
         self._recoveries: list[Recovery] = []
         self._absent: int = 0
+        self._suspects: list[Disturbance] = []
+        self._sent: Frame | None = None
         self._is_charged: bool = False
         self._is_calm: bool = True
         self._plan_wake(0)
@@ -91,10 +93,7 @@ class Wire(Wiring):
             bits = frame.bits
             if bits == 0:
                 bits = frame.measure()
-        disruptions: list[Disruption] = []
-        until = now + (bits + MARGIN) * medium.bit_ns
-        for disturbance in self.disturbances:
-            disruptions.extend(disturbance.errors(now, until, medium.bit_ns, frame, sender))
+        disruptions = self._ask(now, now + (bits + MARGIN) * medium.bit_ns, frame, sender)
         if first is None or disruptions or self._unsettled or self._is_contested(first):
             self._attempt(now, self._offers(now), disruptions)
             return
@@ -108,6 +107,17 @@ class Wire(Wiring):
         medium.busy_ns += bits * medium.bit_ns
         medium.end = now + bits * medium.bit_ns
         medium.is_watched = self._is_charged or not self._is_calm
+
+    def _ask(self, now: int, until: int, frame: Frame | None, sender: int) -> list[Disruption]:
+        """What disturbs the next attempt; who does is noted."""
+        disruptions: list[Disruption] = []
+        self._suspects = []
+        for disturbance in self.disturbances:
+            found = disturbance.errors(now, until, self.medium.bit_ns, frame, sender)
+            if found:
+                disruptions.extend(found)
+                self._suspects.append(disturbance)
+        return disruptions
 
     def _is_contested(self, first: tuple[Frame, Port]) -> bool:
         """Nobody is there to acknowledge, or another port begins with the same arbitration bits."""
@@ -168,6 +178,7 @@ class Wire(Wiring):
         bits = run(controllers, disruptions, LIMIT)
         self.attempts += 1
         self._engaged = controllers
+        self._sent = offers[0][0] if offers else None
         self._started_ns = now
         steps = steps_of(controllers, bits, medium.ports)
         self._steps = steps
@@ -224,10 +235,13 @@ class Wire(Wiring):
                 self._count(now, step.port, step.tec, step.rec, events)
             elif step.kind == ERROR and step.error is not None:
                 medium.errors += 1
+                self._blame(now)
                 can_id, data = write_bus_error(step.error)
                 events.append(WireEvent(Frame(can_id, data, FLAG_ERROR), step.port, []))
             elif step.frame is not None:
                 medium.frames += 1
+                if step.frame != self._sent:
+                    self._blame(now)
                 events.append(WireEvent(step.frame, step.port, step.ports))
             elif step.kind == END:
                 self._ended(now)
@@ -239,6 +253,12 @@ class Wire(Wiring):
             self._finish_recoveries(now, events)
             self._plan_wake(now)
         self.sink.happened(now, events)
+
+    def _blame(self, now: int) -> None:
+        """Tell those that disrupted bits of this attempt that it was noticed."""
+        suspects, self._suspects = self._suspects, []
+        for disturbance in suspects:
+            disturbance.disturbed(now, self._sent)
 
     def _passed(self, now: int, events: list[WireEvent]) -> None:
         """A frame has passed undisturbed: the counters fall."""
@@ -353,6 +373,20 @@ class Wire(Wiring):
             self._plan_wake(now)
             self.sink.happened(now, events)
 
+    def restart(self, now: int, port: Port, delay_ns: int = 0) -> None:
+        """Ask a port that is bus-off, and was not asked yet, to restart in `delay_ns`, whatever its `restart_ns`."""
+        for recovery in self._recoveries:
+            if recovery.port is port:
+                return
+        if port.state is ErrorState.BUS_OFF:
+            self._recoveries.append(Recovery(port, now + delay_ns))
+            self._is_calm = False
+            self._plan_wake(now)
+
+    def replan(self, now: int) -> None:
+        """A disturbance has begun or ended: ask to be woken for it. Whoever calls sees to it that the loop notices."""
+        self._plan_wake(now)
+
     def disconnect(self, now: int, port: Port) -> None:
         """Its node is unplugged: what waits is lost, and nobody acknowledges there any more."""
         if is_present(port):
@@ -412,9 +446,7 @@ class Wire(Wiring):
     def _disturb(self, now: int) -> None:
         """Nothing is sent, but something may be seen."""
         bit_ns = self.medium.bit_ns
-        disruptions: list[Disruption] = []
-        for disturbance in self.disturbances:
-            disruptions.extend(disturbance.errors(now, now + MARGIN * bit_ns, bit_ns, None, -1))
+        disruptions = self._ask(now, now + MARGIN * bit_ns, None, -1)
         for disruption in disruptions:
             if disruption.kind != NO_ACK and len(self.medium.ports) > self._absent:
                 self._settle(now)

@@ -6,13 +6,22 @@ values do not fit the target. Further ones come from other packages, see `fi_gat
 
 from typing import Annotated, Final, TypeAlias
 
-from fi_gateway.boundary import Later
 from fi_gateway.fault_specs.base import CobId, FaultSpec, Payload, Ratio, Scalar, needed_signal, raw_value
 from fi_gateway.fault_specs.bits import BitFlipSpec, BitStuckSpec
 from fi_gateway.fault_specs.forgery import CorruptDlcSpec, InsertSpec, MasqueradeSpec
 from fi_gateway.fault_specs.hold import PackageDropSpec, StuckAtSpec, StuckAtValueSpec, TimeDelaySpec
 from fi_gateway.fault_specs.passage import DelaySpec, DropSpec, DuplicateSpec, ReplaySpec, ResequenceSpec
 from fi_gateway.fault_specs.value import BiasSpec, DriftSpec, GainSpec, NoiseSpec
+from fi_gateway.fault_specs.wire import (
+    BabblingIdiotSpec,
+    BitErrorRateSpec,
+    BitErrorSpec,
+    BusOffSpec,
+    GilbertElliottSpec,
+    NoAckSpec,
+    StuckDominantSpec,
+    WireFaultSpec,
+)
 from fi_gateway.kinds import Kinds
 
 FAULTS: Final = Kinds(
@@ -38,11 +47,27 @@ FAULTS: Final = Kinds(
         InsertSpec,
         MasqueradeSpec,
         CorruptDlcSpec,
+        BitErrorSpec,
+        StuckDominantSpec,
+        NoAckSpec,
+        BitErrorRateSpec,
+        GilbertElliottSpec,
+        BusOffSpec,
+        BabblingIdiotSpec,
     ),
 )
 
-FaultChoice: TypeAlias = Annotated[
-    FaultSpec, FAULTS, Later(("bit_error", "stuck_dominant", "no_ack", "babbling_idiot", "bus_off"))
-]
+FaultChoice: TypeAlias = Annotated[FaultSpec, FAULTS]
 
-__all__ = ["FAULTS", "CobId", "FaultChoice", "FaultSpec", "Payload", "Ratio", "Scalar", "needed_signal", "raw_value"]
+__all__ = [
+    "FAULTS",
+    "CobId",
+    "FaultChoice",
+    "FaultSpec",
+    "Payload",
+    "Ratio",
+    "Scalar",
+    "WireFaultSpec",
+    "needed_signal",
+    "raw_value",
+]

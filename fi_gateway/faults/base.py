@@ -53,6 +53,9 @@ class Fault:
         """`wake_at` has come: insert what is due and move `wake_at` on."""
         raise NotImplementedError
 
+    def bound(self, end_ns: int) -> None:
+        """The window ends at `end_ns`, NEVER when that is not known yet: said after `begin`, and again before `end`."""
+
     def end(self) -> None:
         """The activation is over: forget what belongs to it."""
 

@@ -18,6 +18,7 @@ from canopen_exo.bus.node import MS, SECOND
 from fi_gateway.control import InjectorRow
 from fi_gateway.control_socket import ask, ask_listing, ask_to_add
 from fi_gateway.errors import FaultError
+from fi_gateway.schema import refuse_wire_faults
 from testbench.errors import BenchError
 from testbench.merge import merge
 from testbench.plugin.exo import Exo
@@ -28,6 +29,8 @@ from testbench.record import Truth
 from testbench.scenario import Scenario
 from testbench.supervisor import Setup, Supervisor
 
+_WHAT: Final = "a rig of processes"
+
 _SENDING_NS: Final = SECOND
 """Most that a frame of the test may wait for its interface."""
 
@@ -37,6 +40,7 @@ class RealTimeGateway(GatewayControl):
     """The gateway process of a real-time rig, by its live control."""
 
     def __init__(self, scenario: Scenario) -> None:
+        refuse_wire_faults(scenario.injectors, _WHAT)
         super().__init__(scenario)
         self._address: str = ""
 
@@ -57,6 +61,11 @@ class RealTimeGateway(GatewayControl):
     def _add(self, name: str, given: Part, at_once: bool) -> None:
         before = self.additions.specs
         self.additions.read(name, given)
+        try:
+            refuse_wire_faults(self.additions.specs, _WHAT)
+        except FaultError:
+            self.additions.specs = before
+            raise
         if self._address:
             try:
                 ask_to_add(self._address, name, given, at_once)
