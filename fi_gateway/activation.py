@@ -40,11 +40,11 @@ class Activation:
     frames_seen: target frames that reached it; frames_unfit: of those, too short to act on; frames_injected: acted on
     (a drop that spares a frame does not act on it); of those, each at most once: frames_changed: went on at once with
     other content; frames_lost; frames_delayed: went on later, changed or not, or waited behind one that did.
-    frames_inserted: further frames. Of a wire fault, attempts_seen: attempts to send a target frame while the window was
-    open, a retransmission being one of its own; attempts_disturbed: those, or idle times, in which somebody noticed an
-    error, or the bus-off that it made.
-    saturated: values cut at the signal's range; first_before, first_after: the first frame hit (first_after None: it was
-    lost, or disturbed on its way; first_before None: it was inserted without one arriving).
+    frames_inserted: further frames. Of a wire fault, attempts_seen: attempts to send a target frame while the window
+    was open, a retransmission being one of its own; attempts_disturbed: those, or idle times, in which somebody noticed
+    an error, or the bus-off that it made.
+    saturated: values cut at the signal's range; first_before, first_after: the first frame hit (first_after None: it
+    was lost, or disturbed on its way; first_before None: it was inserted without one arriving).
     """
 
     def __init__(

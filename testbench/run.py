@@ -179,15 +179,19 @@ def _stats(rig: Rig, medium: Medium) -> BusStats:
 
 
 def _invalid_reasons(rig: Rig) -> list[str]:
-    """Why the run proves nothing: frames lost without a fault, two senders with one id. A cut bus explains both."""
+    """Why the run proves nothing: frames lost without a fault, two senders with one id.
+
+    A cut bus explains both, and so does a wire fault that did something: what waits for one bus then floods the other.
+    """
     media = (rig.controller_bus, rig.drive_bus)
-    cut = any(medium.cuts for medium in media)
+    on_wire = any(one.wire is not None and one.manifested for one in rig.gateway.injectors)
+    cut = on_wire or any(medium.cuts for medium in media)
     reasons = []
     for medium in media:
         dropped = sum(port.dropped for port in medium.ports)
         if dropped and not cut:
             reasons.append(f"{medium.name} bus: {dropped} frames lost in full transmit queues")
-        if medium.collisions:
+        if medium.collisions and not on_wire:
             reasons.append(f"{medium.name} bus: two senders with the same CAN id at once, {medium.collisions} times")
     if not rig.gateway.injectors and not cut and not rig.controller.completed:
         reasons.append("the motion was given up without a fault")
