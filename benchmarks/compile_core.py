@@ -75,6 +75,7 @@ INTERPRETED: Final = {
     "fi_gateway/addition.py": "injectors are read once, through pydantic",
     "fi_gateway/*control*.py": "called by people and scripts, not per frame",
     "fi_gateway/boundary.py": "files are read once, through pydantic",
+    "fi_gateway/fiblock_compat.py": "whole arrays, outside of runs",
     "fi_gateway/marked_yaml.py": "files are read once, through PyYAML",
     "fi_gateway/quantity.py": "files are read once",
     "fi_gateway/schema.py": "files are read once, through pydantic",
