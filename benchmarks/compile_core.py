@@ -78,6 +78,8 @@ INTERPRETED: Final = {
     "fi_gateway/fiblock_compat.py": "whole arrays, outside of runs",
     "fi_gateway/marked_yaml.py": "files are read once, through PyYAML",
     "fi_gateway/quantity.py": "files are read once",
+    "fi_gateway/replay.py": "called once an activation, in replays only",
+    "fi_gateway/rng_state.py": "called once an activation",
     "fi_gateway/schema.py": "files are read once, through pydantic",
     "fi_gateway/target.py": "files are read once, through pydantic",
     "hlc/dmp.py": "learning is numpy; two short calls a cycle are not",

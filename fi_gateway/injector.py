@@ -17,6 +17,7 @@ from fi_gateway.effects import Effect
 from fi_gateway.errors import FaultError
 from fi_gateway.events import Event
 from fi_gateway.faults import Fault
+from fi_gateway.rng_state import state_of
 
 
 class Phase(Enum):
@@ -46,6 +47,7 @@ _ACTIVATION_STATE: Final = (
     "saturated",
     "first_before",
     "first_after",
+    "stream",
 )
 _INJECTOR_STATE: Final = (
     "phase",
@@ -113,6 +115,8 @@ class Activation:
     frames_seen: target frames that reached it; frames_unfit: of those, too short to act on; frames_injected: acted on
     (a drop that spares a frame does not act on it); frames_changed: of those, changed or lost; saturated: values cut at
     the signal's range; first_before, first_after: the first changed frame (first_after None: it was lost).
+    stream: where the injector's random stream stood before the fault began (`rng_state`), and after a "/" once the
+    window was open, if something was drawn between; with it the fault's own draws can be had again.
     """
 
     def __init__(
@@ -133,6 +137,7 @@ class Activation:
         self.saturated: int = 0
         self.first_before: Frame | None = None
         self.first_after: Frame | None = None
+        self.stream: str = ""
 
     def __reduce__(
         self,
@@ -227,12 +232,15 @@ class Injector:
         if self.phase is not WAITING:
             self._cause, self._due_ns = cause, now
         start_ns = now if now > self._due_ns else self._due_ns  # a frame stamped before a command, read after it
+        stood = state_of(self._rng)
         if not self._fault.begin(start_ns, self.held, self._rng):
             self.phase, self.next_ns = WAITING, NEVER
             return None
         opened = Activation(
             self.name, self.activated, self._signal, self._cause, self._due_ns, start_ns, self._effect.duration()
         )
+        stands = state_of(self._rng)
+        opened.stream = stood if stands == stood else f"{stood}/{stands}"
         self.phase, self.next_ns, self._current = ACTIVE, opened.end_ns, opened
         self.activated += 1
         self._left = self._effect.frames

@@ -18,7 +18,8 @@ from fi_gateway.fault_specs import FaultChoice, FaultSpec
 from fi_gateway.injector import Injector, Target, Trigger, stream
 from fi_gateway.marked_yaml import Data, Keys, did_you_mean, dotted
 from fi_gateway.quantity import format_duration
-from fi_gateway.target import TargetSpec, resolve
+from fi_gateway.replay import RecordedEffect, RecordedEvent, Recording, Window
+from fi_gateway.target import Place, TargetSpec, resolve
 from fi_gateway.timing_specs import EffectChoice, EventChoice
 
 
@@ -184,21 +185,32 @@ def _sentence(name: str, spec: InjectorSpec, plan: BusPlan, duration_ns: int) ->
     return f"{name}{off}: {place.words} {spec.fault.words(place)} {spec.effect.words()}; {when}"
 
 
-def build_injectors(specs: Mapping[str, InjectorSpec], plan: BusPlan, seed: int, run: int) -> list[Injector]:
-    """The engine's injectors in written order, each with its own random stream; raises FaultError for bad specs."""
+def build_injectors(
+    specs: Mapping[str, InjectorSpec],
+    plan: BusPlan,
+    seed: int,
+    run: int,
+    recorded: Mapping[str, tuple[Window, ...]] | None = None,
+) -> list[Injector]:
+    """The engine's injectors in written order, each with its own random stream; raises FaultError for bad specs.
+
+    recorded: windows by injector; they then take the place of all events, effects and triggers, and of `enabled`.
+    """
     problems: list[str] = []
     parts = {name: _Parts(spec.target, spec.fault, spec.trigger) for name, spec in specs.items()}
     _check(parts, plan, lambda keys, text: problems.append(f"{dotted(('injectors', *keys))}: {text}"))
     if problems:
         raise FaultError("\n".join(problems))
-    return [_build(name, spec, plan, stream(seed, run, name)) for name, spec in specs.items()]
+    if recorded is None:
+        return [_build(name, spec, plan, stream(seed, run, name)) for name, spec in specs.items()]
+    return [_replay(name, spec, plan, stream(seed, run, name), recorded.get(name, ())) for name, spec in specs.items()]
 
 
 def _build(name: str, spec: InjectorSpec, plan: BusPlan, rng: Generator) -> Injector:
     place = resolve(spec.target, plan)
     return Injector(
         name,
-        Target(place.to_controller, place.to_drives, place.cob_ids, place.name),
+        _target(place),
         spec.fault.build(place),
         spec.event.build(plan, rng),
         spec.effect.build(),
@@ -207,3 +219,21 @@ def _build(name: str, spec: InjectorSpec, plan: BusPlan, rng: Generator) -> Inje
         spec.enabled,
         spec.start == "power_up",
     )
+
+
+def _replay(name: str, spec: InjectorSpec, plan: BusPlan, rng: Generator, windows: tuple[Window, ...]) -> Injector:
+    place, recording = resolve(spec.target, plan), Recording(windows, rng)
+    return Injector(
+        name,
+        _target(place),
+        spec.fault.build(place),
+        RecordedEvent(recording),
+        RecordedEffect(recording, spec.effect.build().frames),
+        None,
+        rng,
+        from_power_up=spec.start == "power_up",
+    )
+
+
+def _target(place: Place) -> Target:
+    return Target(place.to_controller, place.to_drives, place.cob_ids, place.name)

@@ -45,17 +45,19 @@ class InjectionEntry(TypedDict):
     """One activation.
 
     due_s: time drawn, given or triggered; start_s: when the window opened, later only when a value had to come first;
-    end_s: None when its window had no end; frames: changed or lost, of frames_seen target frames; frames_unfit: too
-    short to act on; saturated: values cut at the signal's range; first_*: as in a candump log.
+    duration_s: as drawn or given, None for no limit; end_s: None when its window had no end; frames: changed or lost, of
+    frames_seen target frames; frames_injected: that the fault acted on; frames_unfit: too short to act on; saturated: values cut at the signal's range; first_*: as in a candump log.
     """
 
     injector: str
     index: int
     due_s: float
     start_s: float
+    duration_s: float | None
     end_s: float | None
     frames: int
     frames_seen: int
+    frames_injected: int
     frames_unfit: int
     saturated: int
     signal: str
@@ -152,8 +154,17 @@ class RealTimeEntry(TypedDict):
     faulted: RealTimeRunEntry
 
 
+class ReplayEntry(TypedDict):
+    """Whether a replay gave the recorded frames again. trace_hash: of the recorded faulted run."""
+
+    trace_hash: str
+    same: bool
+
+
 class Summary(TypedDict):
-    """The whole document. source: plant, or bus when foreign drives were on it; realtime: of a real-time run only."""
+    """The whole document. power_up_s: the first frame, negative; source: plant, or bus when foreign drives were on it;
+    realtime: of a real-time run only; replay: of a replay only.
+    """
 
     scenario: str
     seed: int
@@ -166,6 +177,7 @@ class Summary(TypedDict):
     wall_time_s: float
     x_realtime: float
     time0_s: float
+    power_up_s: float
     duration_s: float
     tolerance_deg: float
     bus: dict[str, BusEntry]
@@ -181,6 +193,7 @@ class Summary(TypedDict):
     events: list[EventEntry]
     source: str
     realtime: NotRequired[RealTimeEntry]
+    replay: NotRequired[ReplayEntry]
     versions: dict[str, str]
 
 
@@ -214,6 +227,7 @@ def summary_document(
         "wall_time_s": wall_time_s,
         "x_realtime": sim_time_s / wall_time_s if wall_time_s > 0 else 0.0,
         "time0_s": faulted.time0_ns / 1e9,
+        "power_up_s": (faulted.power_up_ns - faulted.time0_ns) / 1e9,
         "duration_s": faulted.duration_s,
         "tolerance_deg": judgement.tolerance_deg,
         "bus": {
@@ -288,9 +302,11 @@ def _injection(one: Activation, time0_ns: int) -> InjectionEntry:
         "index": one.index,
         "due_s": (one.due_ns - time0_ns) / 1e9,
         "start_s": (one.start_ns - time0_ns) / 1e9,
+        "duration_s": None if one.duration_ns >= NEVER else one.duration_ns / 1e9,
         "end_s": None if one.end_ns >= NEVER else (one.end_ns - time0_ns) / 1e9,
         "frames": one.frames_changed,
         "frames_seen": one.frames_seen,
+        "frames_injected": one.frames_injected,
         "frames_unfit": one.frames_unfit,
         "saturated": one.saturated,
         "signal": one.signal,
@@ -336,6 +352,7 @@ def summary_text(document: Summary) -> str:
         f"      {document['sim_time_s']:.1f} s simulated in {document['wall_time_s']:.2f} s "
         f"({document['x_realtime']:.1f} x real time); {load}",
         *_real_time_lines(document),
+        *_replay_lines(document),
         *_few([f"      {reason}" for reason in document["invalid_reasons"]], 2, "reasons"),
         *_few([_event_line(event) for event in document["events"]], 3, "events"),
     ]
@@ -363,6 +380,13 @@ def _real_time_lines(document: Summary) -> list[str]:
     if document["source"] != "plant":
         lines.append("      angles, speeds and torques are what the drives' frames said (source: bus)")
     return lines
+
+
+def _replay_lines(document: Summary) -> list[str]:
+    replay = document.get("replay")
+    if replay is None:
+        return []
+    return [f"      replay: {'the same frames as' if replay['same'] else 'other frames than'} in the recorded run"]
 
 
 def _tracking_line(golden: dict[str, float]) -> str:
