@@ -1,7 +1,8 @@
 """Recorded activations, applied again: windows are given, and nothing about when and how long is drawn.
 
 What a fault itself draws while it is active (bits to flip, frames to lose) comes from its stream, which is put where it
-stood when the recorded window opened. So the same rig gives the same frames again, and another rig meets the same faults.
+stood when the recorded window opened. So the same rig gives the same frames again, and another rig meets the same
+faults.
 """
 
 from dataclasses import dataclass
@@ -30,10 +31,13 @@ class Window:
 
 @final
 class Recording:
-    """The windows of one injector in order, and which of them comes next. rng: the injector's stream."""
+    """The windows of one injector in order, and which of them comes next. rng: the injector's stream.
+
+    Windows without length, as a command can leave them, met no frame and are left out.
+    """
 
     def __init__(self, windows: tuple[Window, ...], rng: Generator) -> None:
-        self._windows: Final[tuple[Window, ...]] = windows
+        self._windows: Final[tuple[Window, ...]] = tuple(one for one in windows if one.end_ns > one.start_ns)
         self._rng: Final[Generator] = rng
         self._next: int = 0
         self._start_ns: int = 0

@@ -1,6 +1,6 @@
 """The state of a random stream as text, so that a record can say where in its stream an activation stood."""
 
-from numpy.random import Generator, PCG64
+from numpy.random import PCG64, Generator
 
 from fi_gateway.errors import FaultError
 
@@ -23,4 +23,5 @@ def restore(rng: Generator, text: str) -> None:
             "uinteger": uinteger,
         }
     except (ValueError, OverflowError) as error:
-        raise FaultError(f"random stream: state {text!r} given, allowed is one as recorded with an activation") from error
+        allowed = "allowed is one as recorded with an activation"
+        raise FaultError(f"random stream: state {text!r} given, {allowed}") from error

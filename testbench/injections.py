@@ -1,7 +1,7 @@
 """`injections.csv` of a result folder: one row per activation of an injector, for people and for a replay.
 
-Times are seconds from time 0, to the nanosecond; an empty cell means that there is none. Beside the candump logs and not
-in them, because that format has no comments.
+Times are seconds from time 0, to the nanosecond; an empty cell means that there is none. The file lies beside the
+candump logs, because their format has no comments.
 """
 
 import csv
@@ -57,12 +57,14 @@ def read_injections(path: Path) -> dict[str, tuple[Window, ...]]:
                 raise BenchError(f"{path}:1: no column {missing[0]!r}; give the folder of a result")
             for row in table:
                 try:
+                    if None in row or None in row.values():
+                        raise ValueError("a row with fewer or more cells than columns given")
                     start_ns = nanoseconds(row["start_s"])
                     end_ns = nanoseconds(row["end_s"]) if row["end_s"] else NEVER
-                    windows.setdefault(row["injector"], []).append(Window(start_ns, end_ns, row["stream"] or ""))
-                except (TypeError, ValueError) as error:
+                    windows.setdefault(row["injector"], []).append(Window(start_ns, end_ns, row["stream"]))
+                except ValueError as error:
                     where = f"{path}:{table.line_num}"
-                    raise BenchError(f"{where}: {error}; allowed are times as exo-hil run writes them") from error
+                    raise BenchError(f"{where}: {error}; allowed are rows as exo-hil run writes them") from error
     except (OSError, UnicodeError, csv.Error) as error:
         raise BenchError(f"{path}: cannot be read: {error}; give the folder of a result") from error
     return {name: tuple(found) for name, found in windows.items()}

@@ -20,7 +20,10 @@ from testbench.summary import ReplayEntry, Summary
 
 @dataclass(frozen=True, slots=True)
 class Replay:
-    """What is run again. windows: by injector, from what its times count from; trace_hash: of the recorded faulted run."""
+    """What is run again.
+
+    windows: by injector, from what its times count from; trace_hash: of the recorded faulted run.
+    """
 
     scenario: Scenario
     windows: Mapping[str, tuple[Window, ...]]

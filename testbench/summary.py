@@ -45,8 +45,9 @@ class InjectionEntry(TypedDict):
     """One activation.
 
     due_s: time drawn, given or triggered; start_s: when the window opened, later only when a value had to come first;
-    duration_s: as drawn or given, None for no limit; end_s: None when its window had no end; frames: changed or lost, of
-    frames_seen target frames; frames_injected: that the fault acted on; frames_unfit: too short to act on; saturated: values cut at the signal's range; first_*: as in a candump log.
+    duration_s: as drawn or given, None for no limit; end_s: None when its window had no end; frames: changed or lost,
+    of frames_seen target frames; frames_injected: that the fault acted on; frames_unfit: too short to act on;
+    saturated: values cut at the signal's range; first_*: as in a candump log.
     """
 
     injector: str
