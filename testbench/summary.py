@@ -47,15 +47,16 @@ class InjectionEntry(TypedDict):
     due_s: time drawn, given or triggered; start_s: when the window opened, later only when a value had to come first;
     duration_s: as drawn or given, None for no limit; end_s: None when its window had no end; frames: changed, lost,
     delayed or inserted, and each of these; frames_injected: that the fault acted on, of frames_seen target frames;
-    frames_unfit: too short to act on; saturated: values cut at the signal's range; first_*: as in a candump log.
+    frames_unfit: too short to act on; saturated: values cut at the signal's range; first_frame_s: when the first of
+    `frames` was hit, first_before and first_after: what it was and became, as in a candump log.
     """
 
     injector: str
     index: int
     due_s: float
     start_s: float
-    end_s: float | None
     duration_s: float | None
+    end_s: float | None
     frames: int
     frames_changed: int
     frames_lost: int
@@ -67,6 +68,7 @@ class InjectionEntry(TypedDict):
     saturated: int
     signal: str
     cause: str
+    first_frame_s: float | None
     first_before: str | None
     first_after: str | None
 
@@ -159,8 +161,17 @@ class RealTimeEntry(TypedDict):
     faulted: RealTimeRunEntry
 
 
+class ReplayEntry(TypedDict):
+    """Whether a replay gave the recorded frames again. trace_hash: of the recorded faulted run."""
+
+    trace_hash: str
+    same: bool
+
+
 class Summary(TypedDict):
-    """The whole document. source: plant, or bus when foreign drives were on it; realtime: of a real-time run only."""
+    """The whole document. power_up_s: the first frame, negative; source: plant, or bus when foreign drives were on it;
+    realtime: of a real-time run only; replay: of a replay only.
+    """
 
     scenario: str
     seed: int
@@ -173,6 +184,7 @@ class Summary(TypedDict):
     wall_time_s: float
     x_realtime: float
     time0_s: float
+    power_up_s: float
     duration_s: float
     tolerance_deg: float
     bus: dict[str, BusEntry]
@@ -188,6 +200,7 @@ class Summary(TypedDict):
     events: list[EventEntry]
     source: str
     realtime: NotRequired[RealTimeEntry]
+    replay: NotRequired[ReplayEntry]
     versions: dict[str, str]
 
 
@@ -221,6 +234,7 @@ def summary_document(
         "wall_time_s": wall_time_s,
         "x_realtime": sim_time_s / wall_time_s if wall_time_s > 0 else 0.0,
         "time0_s": faulted.time0_ns / 1e9,
+        "power_up_s": (faulted.power_up_ns - faulted.time0_ns) / 1e9,
         "duration_s": faulted.duration_s,
         "tolerance_deg": judgement.tolerance_deg,
         "bus": {
@@ -295,8 +309,8 @@ def _injection(one: Activation, time0_ns: int) -> InjectionEntry:
         "index": one.index,
         "due_s": (one.due_ns - time0_ns) / 1e9,
         "start_s": (one.start_ns - time0_ns) / 1e9,
-        "end_s": None if one.end_ns >= NEVER else (one.end_ns - time0_ns) / 1e9,
         "duration_s": None if one.duration_ns >= NEVER else one.duration_ns / 1e9,
+        "end_s": None if one.end_ns >= NEVER else (one.end_ns - time0_ns) / 1e9,
         "frames": one.manifested,
         "frames_changed": one.frames_changed,
         "frames_lost": one.frames_lost,
@@ -308,6 +322,7 @@ def _injection(one: Activation, time0_ns: int) -> InjectionEntry:
         "saturated": one.saturated,
         "signal": one.signal,
         "cause": one.cause,
+        "first_frame_s": None if one.first_ns >= NEVER else (one.first_ns - time0_ns) / 1e9,
         "first_before": _frame(one.first_before),
         "first_after": _frame(one.first_after),
     }
@@ -349,6 +364,7 @@ def summary_text(document: Summary) -> str:
         f"      {document['sim_time_s']:.1f} s simulated in {document['wall_time_s']:.2f} s "
         f"({document['x_realtime']:.1f} x real time); {load}",
         *_real_time_lines(document),
+        *_replay_lines(document),
         *_few([f"      {reason}" for reason in document["invalid_reasons"]], 2, "reasons"),
         *_few([_event_line(event) for event in document["events"]], 3, "events"),
     ]
@@ -376,6 +392,13 @@ def _real_time_lines(document: Summary) -> list[str]:
     if document["source"] != "plant":
         lines.append("      angles, speeds and torques are what the drives' frames said (source: bus)")
     return lines
+
+
+def _replay_lines(document: Summary) -> list[str]:
+    replay = document.get("replay")
+    if replay is None:
+        return []
+    return [f"      replay: {'the same frames as' if replay['same'] else 'other frames than'} in the recorded run"]
 
 
 def _tracking_line(golden: dict[str, float]) -> str:
