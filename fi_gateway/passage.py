@@ -251,15 +251,15 @@ class Passage:
                     self._carry_out(now, injector.port, injector, False)
 
     def _settle(self, now: int, arriving: list[Injector]) -> None:
-        """Windows, what is to be said about them on the bus, and the faults that want to be woken now."""
+        """Windows, the faults that want to be woken now, and what is to be said about them on the bus."""
         windows = self.windows
         windows.settle(now, arriving)
-        if windows.opened or windows.said:
+        said, windows.said = windows.said, []
+        if windows.opened or said:
             self.speaks = True
-            said, windows.said = windows.said, []
-            for report in said:
-                self._say(report)
         self._wake(now)
+        for report in said:
+            self._say(report)
 
     def _say(self, report: Report) -> None:
         if report.to_drives:
