@@ -23,6 +23,9 @@ _STATE: Final = (
     "saturated",
     "first_before",
     "first_after",
+    "first_ns",
+    "skipped",
+    "stream",
 )
 """What `__reduce__` copies besides the constructor arguments."""
 
@@ -34,7 +37,8 @@ class Activation:
     injector, index: name, and number of the activation from 0; signal: "node.name", for whole frames the target's name;
     cause: "event", "trigger:<name>" ("trigger:<a>+<b>" for all of them), "frame:0x6F0" or "command"; due_ns: the time
     drawn, given, triggered (delay included) or commanded;
-    start_ns: when the window opened, later than due_ns only when the fault had to wait for a value;
+    start_ns: first instant of the window, later than due_ns when the fault had to wait for a value, and 1 ns later when
+    a target frame had passed the injector in that instant already;
     duration_ns: as drawn or given, NEVER for no limit;
     end_ns: first instant outside the window, as planned until it closes; a window without limit keeps NEVER.
     frames_seen: target frames that reached it; frames_unfit: of those, too short to act on; frames_injected: acted on
@@ -44,7 +48,10 @@ class Activation:
     was open, a retransmission being one of its own; attempts_disturbed: those, or idle times, in which somebody noticed
     an error, or the bus-off that it made.
     saturated: values cut at the signal's range; first_before, first_after: the first frame hit (first_after None: it
-    was lost, or disturbed on its way; first_before None: it was inserted without one arriving).
+    was lost, or disturbed on its way; first_before None: it was inserted without one arriving); first_ns: when that
+    was, NEVER while there is none.
+    For a replay: skipped: target frames of the instant start_ns that had passed before the one with which it opened;
+    stream: where the fault's random stream stood when it began (`rng_state`).
     """
 
     def __init__(
@@ -70,6 +77,9 @@ class Activation:
         self.saturated: int = 0
         self.first_before: Frame | None = None
         self.first_after: Frame | None = None
+        self.first_ns: int = NEVER
+        self.skipped: int = 0
+        self.stream: str = ""
 
     @property
     def manifested(self) -> int:

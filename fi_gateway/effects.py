@@ -19,9 +19,9 @@ from fi_gateway.errors import FaultError
 class Effect:
     """How long an activation lasts.
 
-    frames: it ends after this many frames the fault acted on, 0 for no limit; rearms: whether the injector waits for
-    its event or trigger again afterwards, or is spent for the run; watches: (port, COB-ID) of the frames it wants to
-    observe.
+    frames: it ends after this many frames the fault acted on, or inserted by itself, 0 for no limit; rearms: whether
+    the injector waits for its event or trigger again afterwards, or is spent for the run; watches: (port, COB-ID) of
+    the frames it wants to observe.
     """
 
     def __init__(self, frames: int = 0, rearms: bool = False, watches: tuple[tuple[int, int], ...] = ()) -> None:
@@ -51,7 +51,7 @@ class Once(Effect):
 
 @final
 class Frames(Effect):
-    """So many frames the fault acted on, 1 and more; then the injector arms again.
+    """So many frames the fault acted on, or inserted by itself, 1 and more; then the injector arms again.
 
     FIBlock: Constant time, whose window is a number of samples; its last one is clean.
     """

@@ -20,6 +20,7 @@ from fi_gateway.faults.base import Fault
 from fi_gateway.on_wire import OnWire
 from fi_gateway.outlet import Tray
 from fi_gateway.repair import Repair
+from fi_gateway.rng_state import state_of
 from fi_gateway.trigger import Report, Trigger
 
 
@@ -62,6 +63,8 @@ _INJECTOR_STATE: Final = (
     "_port",
     "_current",
     "_recent",
+    "_instant_ns",
+    "_arrived",
 )
 """What `__reduce__` copies besides the constructor arguments."""
 
@@ -112,7 +115,8 @@ class Injector:
     any but spent --disarm--> inert; inert or spent --arm--> armed, or inert while its start has not come
 
     An event or trigger that comes while waiting or active is ignored. enabled False: never leaves inert until armed.
-    from_power_up: its times count from power-up instead of time 0. rng: the stream of this injector alone (`stream`).
+    from_power_up: its times count from power-up instead of time 0. rng: the stream of this injector alone (`stream`);
+    fault_rng: that of its fault, so that what a fault does to frames does not hang on what decides when (None: rng).
     rearms: whether it arms again after a window, None: as the effect says; max_activations: spent after so many, 0 for
     no limit. repair: what is put right in a payload that the fault has changed. reports: what it says on the bus.
     next_ns: when it acts by itself next (event, or end of the window), NEVER for not at all; wake_ns: when its fault
@@ -141,6 +145,7 @@ class Injector:
         max_activations: int = 0,
         repair: Repair | None = None,
         reports: tuple[Report, ...] = (),
+        fault_rng: Generator | None = None,
     ) -> None:
         signal = fault.signal
         if signal is not None and target.cob_ids != (signal.cob_id,):
@@ -180,6 +185,7 @@ class Injector:
         self._event: Final[Event] = event
         self._effect: Final[Effect] = effect
         self._rng: Final[Generator] = rng
+        self._fault_rng: Final[Generator] = rng if fault_rng is None else fault_rng
         self._given_rearms: Final[bool | None] = rearms
         self._rearms: Final[bool] = effect.rearms if rearms is None else rearms
         self._max_activations: Final[int] = max_activations
@@ -191,6 +197,8 @@ class Injector:
         self._port: int = 0 if target.to_drives else 1
         self._current: Activation | None = None
         self._recent: Activation | None = None
+        self._instant_ns: int = -NEVER
+        self._arrived: int = 0
 
     @property
     def port(self) -> int:
@@ -230,17 +238,26 @@ class Injector:
         if self.phase is not SPENT:
             self.phase, self.next_ns = INERT, NEVER
 
-    def open(self, now: int, cause: str) -> Activation | None:
-        """Open the window at `now`; None when the fault has to wait. For a waiting one the first cause stays."""
+    def open(self, now: int, cause: str, is_arriving: bool = False) -> Activation | None:
+        """Open the window at `now`; None when the fault has to wait. For a waiting one the first cause stays.
+
+        is_arriving: with a target frame that is to be met. Without one, a window that opens when a target frame has
+        passed in this instant starts with the next one.
+        """
         if self.phase is not WAITING:
             self._cause, self._due_ns = cause, now
         start_ns = now if now > self._due_ns else self._due_ns  # a frame stamped before a command, read after it
-        if not self._fault.begin(start_ns, self.held, self._rng):
+        passed = self._arrived if self._instant_ns == start_ns else 0
+        if passed and not is_arriving:
+            start_ns, passed = start_ns + 1, 0
+        stream = state_of(self._fault_rng)
+        if not self._fault.begin(start_ns, self.held, self._fault_rng):
             self.phase, self.next_ns = WAITING, NEVER
             return None
         opened = Activation(
             self.name, self.activated, self._signal, self._cause, self._due_ns, start_ns, self._effect.duration()
         )
+        opened.skipped, opened.stream = passed, stream
         self.phase, self.next_ns, self._current = ACTIVE, opened.end_ns, opened
         self.activated += 1
         self.has_manifested = False
@@ -260,6 +277,13 @@ class Injector:
         """A target frame has reached this injector, whose event looks at each; whether the window opens with it."""
         return self._is_due(now, self._event.observe(now - self._base_ns, frame), False)
 
+    def arrive(self, now: int) -> None:
+        """Count a target frame that has reached this injector, whether or not it acts on it."""
+        if now == self._instant_ns:
+            self._arrived += 1
+        else:
+            self._instant_ns, self._arrived = now, 1
+
     def act(self, now: int, port: int, frame: Frame, tray: Tray) -> Frame | None:
         """What becomes of a target frame that arrives at `now` while active; None: lost, or later (in the tray)."""
         current = self._current
@@ -275,28 +299,25 @@ class Injector:
             return frame
         self._port = port
         result = fault.apply(now, frame, tray)
+        if fault.wake_at != self.wake_ns:
+            self.wake_ns, self.has_news, self.has_turned = fault.wake_at, True, True
         if result is not frame or tray.used:
             if self._repair is not None:
                 result = self._repaired(frame, result, tray)
             self.injected += 1
             current.frames_injected += 1
             if tray.used or result is None:
-                self._count_passage(current, frame, result, tray)
+                self._count_passage(now, current, frame, result, tray)
             elif result != frame:
                 self.manifested += 1
                 current.frames_changed += 1
                 if not self.has_manifested:
-                    self._first(current, frame, result)
+                    self._first(now, current, frame, result)
+            self._use_up(now, 1)
         elif not fault.spares:
             self.injected += 1
             current.frames_injected += 1
-        if fault.wake_at != self.wake_ns:
-            self.wake_ns, self.has_news, self.has_turned = fault.wake_at, True, True
-        if self._left:
-            self._left -= 1
-            if self._left == 0:
-                self.close(now + 1)
-                self.has_news = self.has_turned = True
+            self._use_up(now, 1)
         return result
 
     def wake(self, now: int, tray: Tray) -> None:
@@ -319,8 +340,9 @@ class Injector:
         self.manifested += count
         current.frames_inserted += count
         if not self.has_manifested:
-            self._first(current, None, tray.inserted[0] if tray.inserted else tray.late[0].frame)
+            self._first(now, current, None, tray.inserted[0] if tray.inserted else tray.late[0].frame)
         self.has_news = True
+        self._use_up(now, count)
 
     def disturb(self, now: int, frame: Frame | None) -> None:
         """Its wire fault has disturbed an attempt to send a frame (None: an idle bus), or added one.
@@ -338,7 +360,7 @@ class Injector:
         else:
             current.attempts_disturbed += 1
         if is_first:
-            self._first(current, None if wire.adds else frame, frame if wire.adds else None)
+            self._first(now, current, None if wire.adds else frame, frame if wire.adds else None)
             self.has_manifested = self._current is not None
         if self._left and self._current is not None:
             self._left -= 1
@@ -364,6 +386,7 @@ class Injector:
             return
         self._fault.bound(end_ns)
         self._fault.end()
+        end_ns = end_ns if end_ns > current.start_ns else current.start_ns
         current.end_ns = end_ns
         current.saturated = self._fault.saturated
         if self.wire is not None:
@@ -390,7 +413,7 @@ class Injector:
     def __reduce__(self) -> tuple[type["Injector"], tuple[object, ...], dict[str, object]]:
         given = (self.name, self.target, self._fault, self._event, self._effect, self.trigger, self._rng)
         state = {name: getattr(self, name) for name in _INJECTOR_STATE}
-        more = (self._given_rearms, self._max_activations, self._repair, self.reports)
+        more = (self._given_rearms, self._max_activations, self._repair, self.reports, self._fault_rng)
         return Injector, (*given, self.enabled, self.from_power_up, *more), state
 
     def _arm(self, relative_ns: int) -> None:
@@ -404,7 +427,15 @@ class Injector:
             return True
         return False
 
-    def _count_passage(self, current: Activation, frame: Frame, result: Frame | None, tray: Tray) -> None:
+    def _use_up(self, now: int, frames: int) -> None:
+        """The fault has acted on, or inserted, so many frames; the window ends after the last one of its effect."""
+        if self._left:
+            self._left -= min(frames, self._left)
+            if self._left == 0:
+                self.close(now + 1)
+                self.has_news = self.has_turned = True
+
+    def _count_passage(self, now: int, current: Activation, frame: Frame, result: Frame | None, tray: Tray) -> None:
         """Count a frame that is lost, late, or did not stay alone."""
         later, inserted = len(tray.late), len(tray.inserted)
         if result is None and later:
@@ -422,13 +453,13 @@ class Injector:
                 after = tray.late[0].frame
             elif result is not None and result == frame:
                 after = tray.inserted[0] if tray.inserted else tray.late[0].frame
-            self._first(current, frame, after)
+            self._first(now, current, frame, after)
         if tray.used:
             self.has_news = True
 
-    def _first(self, current: Activation, before: Frame | None, after: Frame | None) -> None:
+    def _first(self, now: int, current: Activation, before: Frame | None, after: Frame | None) -> None:
         """The window has manifested."""
-        current.first_before, current.first_after = before, after
+        current.first_ns, current.first_before, current.first_after = now, before, after
         self.has_manifested = True
         self.manifested_windows += 1
         self.has_news = self.has_turned = True

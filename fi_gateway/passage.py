@@ -6,7 +6,8 @@ written after it as they are then. A frame that a fault has given another COB-ID
 Frames in order wait in a line: one that arrives while frames of its COB-ID wait behind the injector waits behind them.
 
 At one instant: windows (`windows`), then faults that asked to be woken, in written order, then late frames, in the
-order of their times, those of one time as they were sent; then the frame that arrives.
+order of their times, those of one time as they were sent; then the frame that arrives. What a fault does to a frame is
+settled (windows that open by it, faults woken by that) before what it has inserted goes on.
 Nothing is lost without a fault that says so: frames in + inserted = frames out + lost + waiting.
 """
 
@@ -111,7 +112,6 @@ class Passage:
             at = self.next_ns
             if self.windows.next_ns <= at:
                 self._settle(at, [])
-                self._wake(at)
             while self._waiting and self._waiting[0][0] <= at:
                 self._release(at)
             self.plan()
@@ -143,8 +143,9 @@ class Passage:
             left: Frame | None = frame
             is_held = False
             if injector.watches_target and injector.observe_target(now, frame):
-                self._settle(now, [])
+                self._settle(now, [injector])
                 self.plan()
+            injector.arrive(now)
             if injector.phase is ACTIVE:
                 left = injector.act(now, port, frame, self._tray)
                 if injector.has_news:
@@ -187,17 +188,16 @@ class Passage:
         tray = self._tray
         late, inserted = tray.late, tray.inserted
         is_held = is_gone and len(late) > 0
-        if tray.used:
-            tray.clear()
-            for one in late:
-                self._hold(now, port, injector, one)
-            self.inserted[port] += len(inserted) + len(late) - (1 if is_held else 0)
-            for frame in inserted:
-                self._send(now, port, injector.number, frame)
+        tray.clear()
         if injector.has_turned:
             injector.has_turned = False
             self._settle(now, [])
             self.plan()
+        for one in late:
+            self._hold(now, port, injector, one)
+        self.inserted[port] += len(inserted) + len(late) - (1 if is_held else 0)
+        for frame in inserted:
+            self._send(now, port, injector.number, frame)
         return is_held
 
     def _hold(self, now: int, port: int, injector: Injector, later: Later) -> None:
@@ -255,14 +255,15 @@ class Passage:
                     self._carry_out(now, injector.port, injector, False)
 
     def _settle(self, now: int, arriving: list[Injector]) -> None:
-        """Windows, and what is to be said about them on the bus."""
+        """Windows, the faults that want to be woken now, and what is to be said about them on the bus."""
         windows = self.windows
         windows.settle(now, arriving)
-        if windows.opened or windows.said:
+        said, windows.said = windows.said, []
+        if windows.opened or said:
             self.speaks = True
-            said, windows.said = windows.said, []
-            for report in said:
-                self._say(report)
+        self._wake(now)
+        for report in said:
+            self._say(report)
 
     def _say(self, report: Report) -> None:
         if report.to_drives:

@@ -19,8 +19,11 @@ from fi_gateway.event_specs import NeverSpec
 from fi_gateway.fault_specs import FaultChoice, FaultSpec, WireFaultSpec
 from fi_gateway.injector import Injector, Target, stream
 from fi_gateway.marked_yaml import Data, Keys, did_you_mean, dotted
+from fi_gateway.repair import Repair
+from fi_gateway.replay import RecordedEffect, RecordedEvent, Recording, Window
 from fi_gateway.target import Place, TargetSpec, resolve, resolve_wire
 from fi_gateway.timing_specs import EffectChoice, EventChoice, Timing
+from fi_gateway.trigger import Report
 from fi_gateway.trigger_specs import RepairSpec, ReportSpec, TriggerSpec
 
 WIRE_NEEDS: Final = "a run in virtual time (`exo-hil run`) can, and noise `exo-hil hub --timed --errors`"
@@ -285,8 +288,17 @@ def _how_long(spec: InjectorSpec) -> str:
     return f"{words.removesuffix(', once a run')}, {often}"
 
 
-def build_injectors(specs: Mapping[str, InjectorSpec], plan: BusPlan, seed: int, run: int) -> list[Injector]:
-    """The engine's injectors in written order, each with its own random stream; raises FaultError for bad specs."""
+def build_injectors(
+    specs: Mapping[str, InjectorSpec],
+    plan: BusPlan,
+    seed: int,
+    run: int,
+    recorded: Mapping[str, tuple[Window, ...]] | None = None,
+) -> list[Injector]:
+    """The engine's injectors in written order, each with its own random stream; raises FaultError for bad specs.
+
+    recorded: windows by injector; they then take the place of all events, effects and triggers, and of `enabled`.
+    """
     problems: list[str] = []
     parts = {
         name: _Parts(spec.target, spec.fault, spec.trigger, spec.repair, spec.event, spec.effect)
@@ -295,14 +307,16 @@ def build_injectors(specs: Mapping[str, InjectorSpec], plan: BusPlan, seed: int,
     _check(parts, plan, lambda keys, text: problems.append(f"{dotted(('injectors', *keys))}: {text}"))
     if problems:
         raise FaultError("\n".join(problems))
-    return [_build(name, spec, plan, stream(seed, run, name)) for name, spec in specs.items()]
+    if recorded is None:
+        return [_build(name, spec, plan, stream(seed, run, name)) for name, spec in specs.items()]
+    return [_replay(name, spec, plan, stream(seed, run, name), recorded.get(name, ())) for name, spec in specs.items()]
 
 
 def _build(name: str, spec: InjectorSpec, plan: BusPlan, rng: Generator) -> Injector:
     place = spec.place(plan)
     return Injector(
         name,
-        Target(place.to_controller, place.to_drives, place.cob_ids, place.name, place.wire != ""),
+        _target(place),
         spec.fault.build(place),
         spec.event.build(plan, rng),
         spec.effect.build(plan, rng),
@@ -312,6 +326,43 @@ def _build(name: str, spec: InjectorSpec, plan: BusPlan, rng: Generator) -> Inje
         spec.start == "power_up",
         spec.rearms(),
         spec.max_activations or 0,
-        spec.repair.build(place) if spec.repair is not None else None,
-        (spec.report.build(),) if spec.report is not None else (),
+        _repair(spec, place),
+        _reports(spec),
+        _fault_stream(rng),
     )
+
+
+def _replay(name: str, spec: InjectorSpec, plan: BusPlan, rng: Generator, windows: tuple[Window, ...]) -> Injector:
+    """With the recorded windows; what it does to frames, and says about it on the bus, stays."""
+    place, fault_rng = spec.place(plan), _fault_stream(rng)
+    recording = Recording(windows, fault_rng)
+    return Injector(
+        name,
+        _target(place),
+        spec.fault.build(place),
+        RecordedEvent(recording),
+        RecordedEffect(recording, spec.effect.build(plan, rng).frames),
+        None,
+        rng,
+        from_power_up=spec.start == "power_up",
+        repair=_repair(spec, place),
+        reports=_reports(spec),
+        fault_rng=fault_rng,
+    )
+
+
+def _repair(spec: InjectorSpec, place: Place) -> Repair | None:
+    return spec.repair.build(place) if spec.repair is not None else None
+
+
+def _reports(spec: InjectorSpec) -> tuple[Report, ...]:
+    return (spec.report.build(),) if spec.report is not None else ()
+
+
+def _fault_stream(rng: Generator) -> Generator:
+    """The stream of the fault, a branch of the injector's; nothing is drawn for it."""
+    return rng.spawn(1)[0]
+
+
+def _target(place: Place) -> Target:
+    return Target(place.to_controller, place.to_drives, place.cob_ids, place.name, place.wire != "")

@@ -194,7 +194,7 @@ class Windows:
                 cause = "frame"
             link.forget(now)
             if cause:
-                opened = injector.open(now, cause)
+                opened = injector.open(now, cause, injector in arriving)
                 if opened is not None:
                     self.records.append(opened)
                     if self.keeps_opened:

@@ -11,9 +11,13 @@ import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from testbench.cli_rig import CONTROL_ADDRESS, HUB_ADDRESS, add_rig_options, add_verbs, named_buses
+
+if TYPE_CHECKING:
+    from testbench.replay import Replay
+    from testbench.scenario import Scenario
 
 PASS: Final = 0
 FAIL: Final = 1
@@ -59,7 +63,8 @@ def _parser() -> argparse.ArgumentParser:
     verbs = parser.add_subparsers(title="verbs", metavar="VERB", required=True)
 
     run = verbs.add_parser("run", help="golden run + faulted run, verdict", description=_run.__doc__)
-    run.add_argument("scenario", type=Path, metavar="SCENARIO.yaml", help="what to run; see scenarios/")
+    run.add_argument("scenario", type=Path, nargs="?", metavar="SCENARIO.yaml", help="what to run; see scenarios/")
+    run.add_argument("--replay", type=Path, metavar="FOLDER", help="instead: the faults of a result folder, once more")
     run.add_argument("--seed", metavar="N", help="instead of the scenario's seed")
     run.add_argument("--out", type=Path, metavar="DIR", help="result folder (default: results/NAME-SEED[-CHANGES])")
     run.add_argument(
@@ -108,28 +113,26 @@ class _Version(argparse.Action):
 def _run(options: argparse.Namespace) -> int:
     """Run a scenario: a golden run without faults, a run with them, and a verdict on the pair.
 
-    In virtual time, or with --realtime as processes against the clock, on an own hub or on the buses named.
+    In virtual time, or with --realtime as processes against the clock, on an own hub or on the buses named. With
+    --replay the faults of a result folder act again when and as long as they did, whatever started them.
     """
     from fi_gateway.errors import FaultError
     from fi_gateway.marked_yaml import FileErrors
     from fi_gateway.schema import refuse_wire_faults
     from testbench.errors import BenchError
-    from testbench.scenario import load_scenario
     from testbench.store import check_folder, default_folder, result_files, write_result
     from testbench.summary import summary_json, summary_text
 
-    overrides = list(options.overrides)
-    if options.seed is not None:
-        overrides.append(f"seed={options.seed}")
     try:
-        scenario = load_scenario(options.scenario, overrides)
+        scenario, replay = _loaded(options)
         buses = _real_time_buses(options)
         if options.realtime:
             from testbench.realtime_run import check_expectations
 
             check_expectations(scenario, frozenset(options.without))
             refuse_wire_faults(scenario.injectors, "exo-hil run --realtime")
-        folder = options.out or default_folder(scenario.name, scenario.seed, options.overrides)
+        changes = [*options.overrides, *(("replay",) if replay is not None else ())]
+        folder = options.out or default_folder(scenario.name, scenario.seed, changes)
         check_folder(folder)
     except (FileErrors, BenchError, FaultError) as error:
         _say(_as_typed(error, options))
@@ -155,10 +158,12 @@ def _run(options: argparse.Namespace) -> int:
             else:
                 from testbench.run import run_scenario
 
-                result = run_scenario(scenario, progress)
+                result = run_scenario(scenario, progress, None if replay is None else replay.windows)
     except (BenchError, JointEmulatorError, CanopenExoError) as error:
         _say(f"{scenario.name}: run invalid: {error}")
         return INVALID
+    if replay is not None:
+        result.document["replay"] = replay.entry(result.document)
     names = tuple(joint.name for joint in scenario.plan.joints)
     limits = {name: limits_of(name) for name in names}
     title = f"{scenario.name}, seed {scenario.seed}"
@@ -180,6 +185,25 @@ def _places(options: argparse.Namespace, without: frozenset[str]) -> tuple[str, 
     """Where hub and live control listen: where foreign software looks for them, else on a free port and in a folder."""
     listen = options.listen or (HUB_ADDRESS if without else "127.0.0.1:0")
     return listen, options.control or (CONTROL_ADDRESS if "hlc" in without else "")
+
+
+def _loaded(options: argparse.Namespace) -> "tuple[Scenario, Replay | None]":
+    """The scenario to run, and what is replayed in it; raises FileErrors and BenchError."""
+    from testbench.errors import BenchError
+    from testbench.replay import load_replay
+    from testbench.scenario import load_scenario
+
+    overrides = list(options.overrides)
+    if (options.scenario is None) == (options.replay is None):
+        raise BenchError("run: give SCENARIO.yaml, or --replay FOLDER, one of the two")
+    if options.replay is None:
+        if options.seed is not None:
+            overrides.append(f"seed={options.seed}")
+        return load_scenario(options.scenario, overrides), None
+    if options.realtime or options.seed is not None:
+        raise BenchError("--replay runs in virtual time and draws nothing anew; leave out --realtime and --seed")
+    replay = load_replay(options.replay, overrides)
+    return replay.scenario, replay
 
 
 def _real_time_buses(options: argparse.Namespace) -> tuple[str, str] | None:

@@ -70,6 +70,7 @@ def merge(
         truth=truth,
         commands=_commands_of(plan, hlc) if hlc is not None else _commands_from_frames(plan, rows, zero, end),
         activations=[one for one in activations if one.start_ns < on_bus + duration_ns],
+        activations_after=[one for one in activations if one.start_ns >= on_bus + duration_ns],
         buses=tuple(_stats(plan, rows, index, zero, end) for index in (CONTROLLER_BUS, DRIVE_BUS)),
         notes=_notes(plan, zero, hlc, gateway, rows, given_up),
         completed=given_up is None if hlc is None else hlc.completed,

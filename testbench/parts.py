@@ -256,7 +256,7 @@ class _ActivationNote:
     """What an Activation is made again from: constructor arguments, and what it has counted since."""
 
     given: tuple[str, int, str, str, int, int, int]
-    state: dict[str, int | _FrameNote | None]
+    state: dict[str, int | str | _FrameNote | None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -365,8 +365,8 @@ def _activation_note(one: Activation) -> _ActivationNote:
     return _ActivationNote(given, {name: _counted(value) for name, value in state.items()})
 
 
-def _counted(value: object) -> int | _FrameNote | None:
-    if isinstance(value, int):
+def _counted(value: object) -> int | str | _FrameNote | None:
+    if isinstance(value, int | str):
         return value
     assert value is None or isinstance(value, Frame)
     return _frame_note(value)
@@ -378,7 +378,7 @@ def _activation(note: _ActivationNote) -> Activation:
     if set(one.__reduce__()[2]) != set(note.state):
         raise ValueError(f"an activation with {', '.join(note.state)}")
     for name, value in note.state.items():
-        setattr(one, name, value if isinstance(value, int) else _frame(value))
+        setattr(one, name, value if isinstance(value, int | str) else _frame(value))
     return one
 
 

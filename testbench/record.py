@@ -90,7 +90,8 @@ class RunRecord:
     buses: by bus index; activations: in the order they began, closed; notes: in time order; completed: False when the
     controller ended the motion early; held_cycles: per joint, cycles in which its last sample was used again because
     no new one had come; invalid_reasons: why the run proves nothing, empty when it is valid; source: of the truth,
-    "plant", or "bus" when foreign drives were on it and only their frames tell.
+    "plant", or "bus" when foreign drives were on it and only their frames tell; activations_after: as activations, of
+    those that began after the motion, which the result does not count.
     """
 
     rows: list[Transmission]
@@ -105,11 +106,17 @@ class RunRecord:
     held_cycles: list[int] = field(default_factory=list)
     invalid_reasons: list[str] = field(default_factory=list)
     source: str = "plant"
+    activations_after: list[Activation] = field(default_factory=list)
 
     @property
     def valid(self) -> bool:
         """Whether the run can be judged at all."""
         return not self.invalid_reasons
+
+    @property
+    def power_up_ns(self) -> int:
+        """The first classical 11-bit data frame, as the gateway takes it for power-up; time 0 when there is none."""
+        return next((row.end_ns for row in self.rows if row.frame.flags == 0), self.time0_ns)
 
     @property
     def duration_s(self) -> float:

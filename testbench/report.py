@@ -32,6 +32,7 @@ _REFERENCE: Final = "#222222"
 _COMMAND: Final = "#8a8a8a"
 _WINDOW: Final = "#f3c55b"
 _WINDOW_EDGE: Final = "#d99a1c"  # so that a window of one frame is seen too
+_MOST_LANES: Final = 12
 _LIMIT: Final = "#555555"
 _RPM: Final = 30 / np.pi
 
@@ -94,7 +95,10 @@ def windows(shown: Plotted, joint: str | None = None) -> list[tuple[float, float
 
 
 def fault_figure(shown: Plotted) -> "Figure":
-    """The joint at fault: position, velocity and torque over the motion. Imports matplotlib."""
+    """The joint at fault: position, velocity and torque over the motion, and when which injector was active.
+
+    Imports matplotlib.
+    """
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
@@ -105,8 +109,10 @@ def fault_figure(shown: Plotted) -> "Figure":
     said = shown.faulted.commands
     rows = motion_rows(said.t_s, duration_s)
     t_said = said.t_s[rows]
-    figure = Figure(figsize=(11, 8.5), layout="constrained")
-    position, velocity, torque = figure.subplots(3, 1, sharex=True)
+    shares = [6.0, 6.0, 6.0, *([0.4 + 0.8 * len(_laned(shown))] if shown.faulted.activations else [])]
+    figure = Figure(figsize=(11, 8.5 + sum(shares[3:]) * 0.4), layout="constrained")
+    position, velocity, torque, *rest = figure.subplots(len(shares), 1, sharex=True, height_ratios=shares)
+    lanes: Axes | None = rest[0] if rest else None
     low, high = np.degrees(limit.min_angle_rad), np.degrees(limit.max_angle_rad)
     _panel(position, "angle [deg]", (low, high))
     if said.has_reference:
@@ -124,7 +130,9 @@ def fault_figure(shown: Plotted) -> "Figure":
     for axes in (position, velocity, torque):
         _shade(axes, windows(shown, joint))
         axes.set_xlim(0, duration_s)
-    torque.set_xlabel("time from start of motion [s]")
+    if lanes is not None:
+        _lanes(lanes, shown)
+    (torque if lanes is None else lanes).set_xlabel("time from start of motion [s]")
     one = shown.judgement.comparison[joint]
     _heading(figure, shown, joint.replace("_", " "))
     position.set_title(f"RMSE against golden: {one.rmse_position_rad:.4f} rad", loc="right", fontsize=9)
@@ -183,6 +191,37 @@ def _pair(axes: "Axes", golden: Truth, faulted: Truth, before: Array, after: Arr
 def _shade(axes: "Axes", spans: list[tuple[float, float]]) -> None:
     for start_s, end_s in spans:
         axes.axvspan(start_s, end_s, facecolor=(_WINDOW, 0.35), edgecolor=_WINDOW_EDGE, lw=0.9, zorder=0)
+
+
+def _laned(shown: Plotted) -> list[str]:
+    """The injectors that get a lane, in the order in which they began."""
+    return list(dict.fromkeys(one.injector for one in shown.faulted.activations))[:_MOST_LANES]
+
+
+def _lanes(axes: "Axes", shown: Plotted) -> None:
+    """One lane per injector: its windows, filled where frames came out different, and its three counts."""
+    names, faulted = _laned(shown), shown.faulted
+    for lane, name in enumerate(names):
+        found = [one for one in faulted.activations if one.injector == name]
+        for one in found:
+            start = max(0, one.start_ns - faulted.time0_ns)
+            end = min(faulted.duration_ns, min(one.end_ns, NEVER) - faulted.time0_ns)
+            if start < end:
+                fill = _WINDOW if one.manifested else "none"
+                span = (start / 1e9, (end - start) / 1e9)
+                axes.broken_barh([span], (lane - 0.4, 0.45), facecolor=fill, edgecolor=_WINDOW_EDGE, lw=0.9)
+        injected, manifested = sum(one.frames_injected for one in found), sum(one.manifested for one in found)
+        counts = f"{len(found)} activated, {injected} injected, {manifested} manifested"
+        axes.text(0.004, lane + 0.26, counts, fontsize=7, va="center", transform=axes.get_yaxis_transform())
+    axes.set_yticks(range(len(names)), [textwrap.shorten(name, 18, placeholder="...") for name in names], fontsize=7)
+    axes.set_ylim(len(names) - 0.5, -0.6)
+    axes.grid(axis="x", color="#dddddd", lw=0.6)
+    axes.set_axisbelow(True)
+    left_out = len({one.injector for one in faulted.activations}) - len(names)
+    if left_out:
+        axes.set_title(f"and {left_out} more injectors, see injections.csv", loc="right", fontsize=7)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
 
 
 def _heading(figure: "Figure", shown: Plotted, subject: str) -> None:

@@ -6,7 +6,7 @@ them comes from the faults.
 
 import gc
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
@@ -16,6 +16,7 @@ from canopen_exo.bus.frame import FLAG_ERROR
 from canopen_exo.bus.medium import Medium
 from canopen_exo.bus.node import MS, NEVER, SECOND
 from fi_gateway.injector import Injector
+from fi_gateway.replay import Window
 from fi_gateway.schema import build_injectors
 from hlc.limits import limits_of
 from hlc.node import HighLevelController, Phase
@@ -54,12 +55,19 @@ class Result:
     document: Summary
 
 
-def run_scenario(scenario: Scenario, progress: Progress = lambda share: None) -> Result:
-    """Golden run, faulted run, verdict. Raises NotStartedError when the motion of either never begins."""
+def run_scenario(
+    scenario: Scenario,
+    progress: Progress = lambda share: None,
+    recorded: Mapping[str, tuple[Window, ...]] | None = None,
+) -> Result:
+    """Golden run, faulted run, verdict. Raises NotStartedError when the motion of either never begins.
+
+    recorded: windows by injector, in the place of all events, effects and triggers.
+    """
     started = time.perf_counter()
     params = rig_params(scenario)
     golden, golden_ns = run_rig(params, [], lambda share: progress(0.5 * share))
-    injectors = build_injectors(scenario.injectors, params.plan, scenario.seed, 0)
+    injectors = build_injectors(scenario.injectors, params.plan, scenario.seed, 0, recorded)
     faulted, faulted_ns = run_rig(params, injectors, lambda share: progress(0.5 + 0.5 * share))
     names = tuple(joint.name for joint in params.plan.joints)
     judgement = judge(
@@ -155,6 +163,7 @@ def record_of(rig: Rig) -> RunRecord:
         truth=truth,
         commands=commands,
         activations=[one for one in rig.gateway.records if one.start_ns < end],
+        activations_after=[one for one in rig.gateway.records if one.start_ns >= end],
         buses=tuple(_stats(rig, medium) for medium in media),
         notes=[
             RigEvent((event.time_ns - zero) / 1e9, event.joint or "HLC", event.kind, event.text)

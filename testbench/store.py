@@ -19,6 +19,7 @@ from typing import Final
 
 from canopen_exo.bus.trace import write_candump
 from testbench.errors import BenchError
+from testbench.injections import INJECTIONS_FILE, write_injections
 from testbench.record import Array, RunRecord
 from testbench.summary import Summary, summary_json
 
@@ -32,6 +33,7 @@ FILES: Final = frozenset(
     {
         SCENARIO_FILE,
         SUMMARY_FILE,
+        INJECTIONS_FILE,
         *("controller.log", "drive.log", "golden_controller.log", "golden_drive.log"),
         *("golden.parquet", "faulted.parquet", "golden_commands.parquet", "faulted_commands.parquet"),
         *("fault.png", "joints.png"),
@@ -55,6 +57,9 @@ def result_files(
     files: dict[str, Writer] = {
         SCENARIO_FILE: lambda path: _write_text(path, scenario_yaml),
         SUMMARY_FILE: lambda path: _write_text(path, text),
+        INJECTIONS_FILE: lambda path: write_injections(
+            path, [*faulted.activations, *faulted.activations_after], faulted.time0_ns
+        ),
     }
     for name, run in (("golden", golden), ("faulted", faulted)):
         for index, bus in enumerate(run.buses):

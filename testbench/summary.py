@@ -48,15 +48,16 @@ class InjectionEntry(TypedDict):
     duration_s: as drawn or given, None for no limit; end_s: None when its window had no end; frames: changed, lost,
     delayed or inserted, and each of these, and attempts disturbed; attempts_*: of wire faults, to send a target frame,
     seen and disturbed; frames_injected: that the fault acted on, of frames_seen target frames;
-    frames_unfit: too short to act on; saturated: values cut at the signal's range; first_*: as in a candump log.
+    frames_unfit: too short to act on; saturated: values cut at the signal's range; first_frame_s: when the first of
+    `frames` was hit, first_before and first_after: what it was and became, as in a candump log.
     """
 
     injector: str
     index: int
     due_s: float
     start_s: float
-    end_s: float | None
     duration_s: float | None
+    end_s: float | None
     frames: int
     frames_changed: int
     frames_lost: int
@@ -70,6 +71,7 @@ class InjectionEntry(TypedDict):
     saturated: int
     signal: str
     cause: str
+    first_frame_s: float | None
     first_before: str | None
     first_after: str | None
 
@@ -162,8 +164,17 @@ class RealTimeEntry(TypedDict):
     faulted: RealTimeRunEntry
 
 
+class ReplayEntry(TypedDict):
+    """Whether a replay gave the recorded frames again. trace_hash: of the recorded faulted run."""
+
+    trace_hash: str
+    same: bool
+
+
 class Summary(TypedDict):
-    """The whole document. source: plant, or bus when foreign drives were on it; realtime: of a real-time run only."""
+    """The whole document. power_up_s: the first frame, negative; source: plant, or bus when foreign drives were on it;
+    realtime: of a real-time run only; replay: of a replay only.
+    """
 
     scenario: str
     seed: int
@@ -176,6 +187,7 @@ class Summary(TypedDict):
     wall_time_s: float
     x_realtime: float
     time0_s: float
+    power_up_s: float
     duration_s: float
     tolerance_deg: float
     bus: dict[str, BusEntry]
@@ -191,6 +203,7 @@ class Summary(TypedDict):
     events: list[EventEntry]
     source: str
     realtime: NotRequired[RealTimeEntry]
+    replay: NotRequired[ReplayEntry]
     versions: dict[str, str]
 
 
@@ -224,6 +237,7 @@ def summary_document(
         "wall_time_s": wall_time_s,
         "x_realtime": sim_time_s / wall_time_s if wall_time_s > 0 else 0.0,
         "time0_s": faulted.time0_ns / 1e9,
+        "power_up_s": (faulted.power_up_ns - faulted.time0_ns) / 1e9,
         "duration_s": faulted.duration_s,
         "tolerance_deg": judgement.tolerance_deg,
         "bus": {
@@ -298,8 +312,8 @@ def _injection(one: Activation, time0_ns: int) -> InjectionEntry:
         "index": one.index,
         "due_s": (one.due_ns - time0_ns) / 1e9,
         "start_s": (one.start_ns - time0_ns) / 1e9,
-        "end_s": None if one.end_ns >= NEVER else (one.end_ns - time0_ns) / 1e9,
         "duration_s": None if one.duration_ns >= NEVER else one.duration_ns / 1e9,
+        "end_s": None if one.end_ns >= NEVER else (one.end_ns - time0_ns) / 1e9,
         "frames": one.manifested,
         "frames_changed": one.frames_changed,
         "frames_lost": one.frames_lost,
@@ -313,6 +327,7 @@ def _injection(one: Activation, time0_ns: int) -> InjectionEntry:
         "saturated": one.saturated,
         "signal": one.signal,
         "cause": one.cause,
+        "first_frame_s": None if one.first_ns >= NEVER else (one.first_ns - time0_ns) / 1e9,
         "first_before": _frame(one.first_before),
         "first_after": _frame(one.first_after),
     }
@@ -354,6 +369,7 @@ def summary_text(document: Summary) -> str:
         f"      {document['sim_time_s']:.1f} s simulated in {document['wall_time_s']:.2f} s "
         f"({document['x_realtime']:.1f} x real time); {load}",
         *_real_time_lines(document),
+        *_replay_lines(document),
         *_few([f"      {reason}" for reason in document["invalid_reasons"]], 2, "reasons"),
         *_few([_event_line(event) for event in document["events"]], 3, "events"),
     ]
@@ -381,6 +397,13 @@ def _real_time_lines(document: Summary) -> list[str]:
     if document["source"] != "plant":
         lines.append("      angles, speeds and torques are what the drives' frames said (source: bus)")
     return lines
+
+
+def _replay_lines(document: Summary) -> list[str]:
+    replay = document.get("replay")
+    if replay is None:
+        return []
+    return [f"      replay: {'the same frames as' if replay['same'] else 'other frames than'} in the recorded run"]
 
 
 def _tracking_line(golden: dict[str, float]) -> str:

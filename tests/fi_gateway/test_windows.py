@@ -151,13 +151,13 @@ def test_a_delay_0_trigger_acts_on_the_same_frame() -> None:
 
 
 def test_manifested_catches_the_same_frame_in_those_written_behind() -> None:
-    """The others, past which it has gone already, act from the next frame on."""
+    """The others, past which it has gone already, start right after it, and act from the next frame on."""
     trigger = Trigger(("a",), "manifested")
     order = [injector("before", trigger=trigger), injector("a", At((50,))), injector("behind", trigger=trigger)]
     gateway, _ = run(1000, order, ((60, tpdo()), (70, tpdo())))
     assert [(one.injector, one.start_ns, one.frames_seen) for one in gateway.records] == [
         ("a", 50, 2),
-        ("before", 60, 1),
+        ("before", 61, 1),
         ("behind", 60, 2),
     ]
 

@@ -142,8 +142,8 @@ def test_bit_error_hits_so_many_attempts() -> None:
     [
         (lambda: BitError("payload", 0), "field 'payload' given, allowed sof, id"),
         (lambda: BitError("data", -1), "bit -1"),
-        (lambda: BitErrorRate(0, BIT, rng()), "ber: rate 0 given, allowed above 0"),
-        (lambda: BitErrorRate(1.5, BIT, rng()), "ber: rate 1.5"),
+        (lambda: BitErrorRate(0, BIT, rng()), "bit_error_rate: rate 0 given, allowed above 0"),
+        (lambda: BitErrorRate(1.5, BIT, rng()), "bit_error_rate: rate 1.5"),
         (lambda: GilbertElliott(0, 0.1, 0, 0.5, BIT, rng()), "gilbert_elliott: enter 0"),
         (lambda: GilbertElliott(0.1, 0.1, -1, 0.5, BIT, rng()), "gilbert_elliott: rate_good -1"),
         (lambda: mask_of([-1]), "port -1 given"),

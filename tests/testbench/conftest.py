@@ -79,6 +79,7 @@ def make_activation(
     start_ns = TIME0_NS + round(start_s * 1e9)
     made = Activation(injector, index, signal, "event", start_ns, start_ns, round(duration_s * 1e9))
     made.frames_seen, made.frames_injected, made.frames_changed = 150, 150, 148
+    made.first_ns = start_ns + 1_000_000
     made.first_before = Frame(0x185, bytes.fromhex("0102030405060708"))
     made.first_after = Frame(0x185, bytes.fromhex("0000000005060708"))
     return made

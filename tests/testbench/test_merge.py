@@ -130,6 +130,7 @@ def test_parts_of_a_run_make_its_record(scenario: Scenario, rig: Rig, expected: 
     assert found.notes == expected.notes
     assert (found.completed, found.held_cycles, found.source) == (True, expected.held_cycles, "plant")
     assert len(found.activations) == 2
+    assert [*found.activations, *found.activations_after] == parts[1].activations
     for one, other in zip(found.buses, expected.buses, strict=True):
         assert (one.name, one.frames, one.queue_overflows) == (other.name, other.frames, 0)
         assert one.load == pytest.approx(other.load, rel=1e-12)  # sums of the same bits, in another unit

@@ -100,6 +100,7 @@ def test_gateway_part_comes_back_as_written(tmp_path: Path) -> None:
     activation = Activation("freeze", 2, "right_knee.position", "trigger:other", 10, 12, NEVER)
     activation.frames_seen, activation.frames_unfit, activation.frames_changed, activation.saturated = 9, 1, 7, 2
     activation.first_before = Frame(0x185, bytes(8))
+    activation.stream = "12.3.0.0"
     controls = [ControlNote(11, "trigger", "freeze", "socket", ""), ControlNote(12, "arm", "x", "bus", "no such")]
     latency = [Lateness(), service().lateness]
     write_gateway(path, GatewayPart(service(), 99, 2, [5, 6], [0, 1], latency, [activation], controls, ROWS))
@@ -108,7 +109,7 @@ def test_gateway_part_comes_back_as_written(tmp_path: Path) -> None:
     for name in ("injector", "index", "signal", "cause", "due_ns", "start_ns", "duration_ns", "end_ns", "frames_seen"):
         assert getattr(one, name) == getattr(activation, name)
     assert (one.frames_unfit, one.frames_changed, one.saturated) == (1, 7, 2)
-    assert (one.first_before, one.first_after) == (Frame(0x185, bytes(8)), None)
+    assert (one.first_before, one.first_after, one.stream) == (Frame(0x185, bytes(8)), None, "12.3.0.0")
     assert found.controls == controls
     assert (found.time_zero, found.injectors, found.frames, found.lost) == (99, 2, [5, 6], [0, 1])
     assert [one.document() for one in found.latency] == [one.document() for one in latency]

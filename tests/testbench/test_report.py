@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
 from PIL import Image
 
 from fi_gateway.activation import Activation
@@ -64,9 +65,9 @@ def test_title_names_scenario_joint_verdict_and_outcome(failed: Plotted) -> None
 
 def test_axes_carry_units_and_both_limits(failed: Plotted) -> None:
     """Labels with units; the limits of table 1 as lines, always inside the picture."""
-    axes = fault_figure(failed).axes
+    *axes, lanes = fault_figure(failed).axes
     assert [one.get_ylabel() for one in axes] == ["angle [deg]", "speed [rpm]", "torque [N m]"]
-    assert axes[-1].get_xlabel() == "time from start of motion [s]"
+    assert lanes.get_xlabel() == "time from start of motion [s]"
     for one, limits in zip(axes, ((-90.0, 0.0), (-65.2, 65.2), (-54.9, 54.9)), strict=True):
         drawn = [np.asarray(line.get_ydata()) for line in one.lines]
         levels = sorted(float(values[0]) for values in drawn if values.size == 2)
@@ -80,10 +81,53 @@ def test_panels_show_what_the_plant_did_in_table_units(failed: Plotted) -> None:
     """The faulted line is the truth of the faulted run, in deg, rpm and N m."""
     truth = failed.faulted.truth
     expected = (np.degrees(truth.q[:, 4]), truth.dq[:, 4] * 30 / np.pi, truth.tau[:, 4])
-    for axes, values in zip(fault_figure(failed).axes, expected, strict=True):
+    for axes, values in zip(fault_figure(failed).axes[:3], expected, strict=True):
         drawn = [np.asarray(line.get_ydata()) for line in axes.lines]
         assert any(one.shape == values.shape and np.allclose(one, values) for one in drawn)
         assert axes.get_ylim()[1] > values.max()
+
+
+def lane_bars(axes: Axes) -> list[tuple[float, float, bool]]:
+    """Start, end and whether it is filled, of each window drawn in the lanes."""
+    bars = []
+    for bar in axes.collections:
+        (path,) = bar.get_paths()
+        ends = np.asarray(path.vertices, np.float64)[:, 0]
+        is_filled = np.asarray(bar.get_facecolor()).size > 0
+        bars.append((round(float(np.min(ends)), 9), round(float(np.max(ends)), 9), is_filled))
+    return bars
+
+
+def test_every_injector_has_a_lane_with_its_windows_and_counts(failed: Plotted) -> None:
+    """faults.md: activated, injected and manifested are three counts; drawn where they belong."""
+    lanes = fault_figure(failed).axes[3]
+    assert [label.get_text() for label in lanes.get_yticklabels()] == ["freeze_position", "zero_velocity"]
+    counts = ["2 activated, 300 injected, 296 manifested", "1 activated, 150 injected, 148 manifested"]
+    assert [text.get_text() for text in lanes.texts] == counts
+    assert lane_bars(lanes) == [(3.0, 3.3, True), (5.0, 5.3, True), (3.1, 3.4, True)]
+
+
+def test_window_that_changed_nothing_is_hollow(run_maker: RunMaker, activation_maker: ActivationMaker) -> None:
+    """Activated is not manifested."""
+    one = activation_maker()
+    one.frames_changed = 0
+    lanes = fault_figure(shown(run_maker(), run_maker(activations=[one]))).axes[3]
+    assert lane_bars(lanes) == [(3.0, 3.3, False)]
+
+
+def test_lanes_are_as_many_as_can_be_read(run_maker: RunMaker, activation_maker: ActivationMaker) -> None:
+    """More injectors than lanes: the plot says where the others are."""
+    hit = [activation_maker(f"injector_{number}") for number in range(20)]
+    lanes = fault_figure(shown(run_maker(), run_maker(activations=hit))).axes[3]
+    assert len(lanes.get_yticklabels()) == 12
+    assert lanes.get_title(loc="right") == "and 8 more injectors, see injections.csv"
+
+
+def test_run_without_activations_has_no_lanes(run_maker: RunMaker) -> None:
+    """An empty strip would say nothing."""
+    axes = fault_figure(shown(run_maker(), run_maker())).axes
+    assert len(axes) == 3
+    assert axes[-1].get_xlabel() == "time from start of motion [s]"
 
 
 def test_huge_command_does_not_squeeze_the_torques(failed: Plotted) -> None:

@@ -600,7 +600,10 @@ def test_injections_at_or_after_the_end_of_the_motion_are_not_recorded() -> None
     assert [one.injector for one in record.activations] == [f"n{duration - 1}"]
     assert record.activations[0].start_ns == record.time0_ns + duration - 1
     assert record.completed
-    assert "power up" in {one.injector for one in rig.gateway.records}
+    after = [one.injector for one in record.activations_after]
+    assert after == [one.injector for one in rig.gateway.records[1:]]
+    assert after[0] == f"n{duration}"
+    assert after[-1] == "power up"
 
 
 # ---- other bus plans ----------------------------------------------------------------------------------------------

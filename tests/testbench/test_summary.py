@@ -7,6 +7,8 @@ from dataclasses import replace
 
 import pytest
 
+from canopen_exo.bus.frame import FLAG_REMOTE, Frame
+from canopen_exo.bus.medium import Transmission
 from canopen_exo.bus.node import NEVER
 from canopen_exo.bus.trace import trace_hash
 from fi_gateway.activation import Activation
@@ -14,7 +16,15 @@ from hlc.limits import limits_of
 from testbench.errors import BenchError
 from testbench.expect import parse_expectation
 from testbench.record import RunRecord
-from testbench.summary import MOST_LINES, Summary, check_finite, summary_document, summary_json, summary_text
+from testbench.summary import (
+    MOST_LINES,
+    ReplayEntry,
+    Summary,
+    check_finite,
+    summary_document,
+    summary_json,
+    summary_text,
+)
 from testbench.verdict import judge
 
 RunMaker = Callable[..., RunRecord]
@@ -62,7 +72,7 @@ def test_document_says_what_was_judged(failed: Summary) -> None:
     assert (failed["scenario"], failed["seed"], failed["valid"]) == ("knee_freeze", 2020, True)
     assert (failed["verdict"], failed["outcome"]) == ("fail", "failure")
     assert failed["x_realtime"] == 8.5
-    assert failed["time0_s"] == 3.000056
+    assert (failed["time0_s"], failed["power_up_s"]) == (3.000056, 0.0)  # the first frame of these runs is at time 0
     assert [one["met"] for one in failed["expectations"]] == [True, False]
     assert failed["failures"][0]["joint"] == "right_knee"
     assert failed["events"][0]["text"] == "0x8400 velocity"
@@ -73,6 +83,7 @@ def test_injection_times_count_from_time_0(failed: Summary) -> None:
     """Activations carry the loop's clock, the result counts from time 0, exact to the nanosecond."""
     first, second = failed["injections"]
     assert (first["start_s"], first["end_s"], first["frames"], first["frames_seen"]) == (3.0, 3.3, 148, 150)
+    assert (first["duration_s"], first["frames_injected"]) == (0.3, 150)
     assert (first["signal"], second["signal"]) == ("right_knee.position", "")
     assert (first["first_before"], first["first_after"]) == ("185#0102030405060708", "185#0000000005060708")
     assert failed["counts"] == {"activated": 2, "injected": 300, "manifested": 296}
@@ -80,11 +91,31 @@ def test_injection_times_count_from_time_0(failed: Summary) -> None:
 
 def test_window_without_end_and_lost_frame_are_null(run_maker: RunMaker, activation_maker: ActivationMaker) -> None:
     """NEVER is no number of seconds; a lost frame has no bytes."""
-    endless = activation_maker()
-    endless.end_ns, endless.first_after = NEVER, None
+    endless = activation_maker(duration_s=NEVER / 1e9)
+    endless.first_after = None
     (entry,) = document(run_maker(), run_maker(activations=[endless]))["injections"]
-    assert entry["end_s"] is None
+    assert entry["end_s"] is entry["duration_s"] is None
     assert entry["first_after"] is None
+
+
+def test_power_up_is_the_first_frame_that_a_gateway_counts_from(run_maker: RunMaker) -> None:
+    """A classical 11-bit data frame: nothing else starts the times of `from: power_up`."""
+    run = run_maker()
+    zero = run.time0_ns
+    early = [
+        Transmission(zero - 9_000, 1, Frame(0x700, b"", FLAG_REMOTE, 1), 0),
+        Transmission(zero - 5_000, 1, Frame(0x701, b"\0"), 0),
+    ]
+    assert document(run, replace(run, rows=[*early, *run.rows]))["power_up_s"] == -5e-6
+
+
+@pytest.mark.parametrize(("same", "words"), [(True, "the same frames as"), (False, "other frames than")])
+def test_text_says_whether_a_replay_gave_the_same_frames(failed: Summary, same: bool, words: str) -> None:
+    """A replay that does not repeat the run must not look as if it did."""
+    entry: ReplayEntry = {"trace_hash": "0" * 64, "same": same}
+    replayed: Summary = {**failed, "replay": entry}
+    assert f"replay: {words} in the recorded run" in summary_text(replayed)
+    assert "replay" not in summary_text(failed)
 
 
 def test_trace_hashes_are_those_of_the_rows(run_maker: RunMaker) -> None:
