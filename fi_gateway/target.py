@@ -199,7 +199,7 @@ def resolve(target: TargetSpec, plan: BusPlan) -> Place:
     if target.wire is not None:
         raise SpecError(("wire",), f"only wire faults ({WIRE_WORDS}) act on a bus; other faults act in the gateway")
     if target.bus is None:
-        raise SpecError((), f"bus is missing: write {TO_CONTROLLER}, {TO_DRIVES} or both")
+        raise SpecError(("bus",), f"missing; needed: bus, which is {TO_CONTROLLER}, {TO_DRIVES} or both")
     if target.node is not None and not (target.node == CONTROLLER and target.kind == "heartbeat"):
         _joint(target.node, plan)
     if target.pdo is not None:

@@ -22,6 +22,7 @@ _COLUMNS: Final = (
     *("injector", "index", "signal", "cause", "due_s", "start_s", "duration_s", "end_s"),
     *("frames_seen", "frames_unfit", "frames_injected", "frames_manifested"),
     *("frames_changed", "frames_lost", "frames_delayed", "frames_inserted", "saturated"),
+    *("attempts_seen", "attempts_disturbed"),
     *("first_frame_s", "first_before", "first_after", "skipped", "stream"),
 )
 
@@ -43,6 +44,7 @@ def write_injections(path: Path, activations: Sequence[Activation], time0_ns: in
                     "" if one.end_ns >= NEVER else seconds(one.end_ns - time0_ns),
                     *(one.frames_seen, one.frames_unfit, one.frames_injected, one.manifested),
                     *(one.frames_changed, one.frames_lost, one.frames_delayed, one.frames_inserted, one.saturated),
+                    *(one.attempts_seen, one.attempts_disturbed),
                     "" if one.first_ns >= NEVER else seconds(one.first_ns - time0_ns),
                     *(_frame(one.first_before), _frame(one.first_after), one.skipped, one.stream),
                 )

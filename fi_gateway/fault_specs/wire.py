@@ -141,13 +141,13 @@ class BusOffSpec(WireFaultSpec):
     """The controller of a node goes bus-off; it is asked to restart that long after the window."""
 
     type: Literal["bus_off"]
-    restart_ns: Annotated[Time, Field(alias="restart")] = 0
+    restart_ns: Annotated[Time | None, Field(alias="restart")] = None
 
     def build(self, place: Place) -> OnWire:
         """See BusOff."""
         if not place.node or place.cob_ids:
             raise SpecError((), f"bus_off acts on a node; give node alone in the target: {' | '.join(place.nodes)}")
-        return SwitchedOff(place.wire, place.nodes.index(place.node), self.restart_ns)
+        return SwitchedOff(place.wire, place.nodes.index(place.node), self.restart_ns or 0)
 
     def words(self, place: Place) -> str:
         """For people."""

@@ -9,7 +9,7 @@ from canopen_exo.bus.frame import Frame
 from canopen_exo.bus.node import MS, SECOND
 from canopen_exo.plan import BusPlan, JointNode
 from fi_gateway.boundary import dump, validate
-from fi_gateway.fault_specs import FAULTS
+from fi_gateway.fault_specs import FAULTS, WireFaultSpec
 from fi_gateway.faults import Fault
 from fi_gateway.marked_yaml import FileErrors, parse
 from fi_gateway.schema import InjectorSpec, check_injectors
@@ -268,8 +268,9 @@ def test_a_fault_can_be_read_aloud_and_written_back(fault: str, target: str, wor
 
 
 def test_every_new_type_is_in_these_tables() -> None:
-    """Each built-in type is read, refused and said in words, here or in the tests of the schema."""
-    elsewhere = {"stuck_at", "stuck_at_value", "bias", "bit_flip"}
+    """Each built-in type is read, refused and said in words, here or in the tests of schema and wire faults."""
+    wire = {word for word, found in FAULTS.built_in.items() if issubclass(found, WireFaultSpec)}
+    elsewhere = {"stuck_at", "stuck_at_value", "bias", "bit_flip"} | wire
     for table in (REFUSED, WORDS):
         types = {str(row[0]).removeprefix("{type: ").split(",")[0].rstrip("}") for row in table}
         assert types == set(FAULTS.built_in) - elsewhere

@@ -25,9 +25,15 @@ PLAN: Final = BusPlan(tuple(JointNode(name, number, 54_900, 131_072) for number,
 
 @pytest.mark.parametrize("line", EXAMPLES)
 def test_every_example_is_read_and_built(line: str) -> None:
-    """On the right knee's position in the first table's block, on its TPDO1 in the second one's."""
-    where = "signal: position" if TEXT.index(line) < TEXT.index("## On whole frames") else "pdo: TPDO1"
-    text = f"x:\n  target: {{bus: to_controller, node: right_knee, {where}}}\n  {line}\n"
+    """On the right knee's position in the first table's block, on its TPDO1 in the second one's; then on a bus."""
+    if TEXT.index(line) > TEXT.index("## On a bus"):
+        kind = line.removeprefix("fault: {type: ").split(",")[0].rstrip("}")
+        target = {"bit_error": "pdo: TPDO1", "no_ack": "kind: sync", "bus_off": "node: left_hip"}.get(kind, "wire: drive")
+    elif TEXT.index(line) < TEXT.index("## On whole frames"):
+        target = "bus: to_controller, node: right_knee, signal: position"
+    else:
+        target = "bus: to_controller, node: right_knee, pdo: TPDO1"
+    text = f"x:\n  target: {{{target}}}\n  {line}\n"
     document = parse(f"{text}  event: {{type: never}}\n  effect: {{type: infinite}}\n", "s.yaml")
     assert isinstance(document.data, dict)
     spec = validate(InjectorSpec, document.data["x"], ("x",), document)

@@ -77,7 +77,8 @@ TABLE: list[tuple[str, ...]] = [
     ("signal the other way", "to_controller", "§to_drives", "position of right_knee does not travel to_drives"),
     ("unknown direction", "to_controller", "§to_master", "unknown bus 'to_master'", "to_controller, to_drives, both"),
     ("unknown fault", "stuck_at}", "§stuckat}", "unknown fault 'stuckat'", "did you mean 'stuck_at'", "bit_flip"),
-    ("fault of a later version", "stuck_at}", "§no_ack}", "'no_ack' is not available yet", "stuck_at, stuck_at_value"),
+    ("wire fault on a signal", "signal: position}\n    fault: {type: stuck_at}", "signal: §position}\n    fault: {type: no_ack}",
+     "wire faults act on frames", "leave signal out"),
     ("whole-frame fault on a signal", "stuck_at}", "§drop}", "drop loses whole frames", "give pdo instead of position"),
     ("unknown trigger", "[freeze]", "[§freze]", "no injector is called 'freze'", "did you mean 'freeze'", "zero"),
     (
