@@ -28,7 +28,8 @@ def test_every_example_is_read_and_built(line: str) -> None:
     """On the right knee's position in the first table's block, on its TPDO1 in the second one's; then on a bus."""
     if TEXT.index(line) > TEXT.index("## On a bus"):
         kind = line.removeprefix("fault: {type: ").split(",")[0].rstrip("}")
-        target = {"bit_error": "pdo: TPDO1", "no_ack": "kind: sync", "bus_off": "node: left_hip"}.get(kind, "wire: drive")
+        others = {"bit_error": "pdo: TPDO1", "no_ack": "kind: sync", "bus_off": "node: left_hip"}
+        target = others.get(kind, "wire: drive")
     elif TEXT.index(line) < TEXT.index("## On whole frames"):
         target = "bus: to_controller, node: right_knee, signal: position"
     else:

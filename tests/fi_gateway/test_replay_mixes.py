@@ -99,7 +99,7 @@ def specs(text: str) -> dict[str, InjectorSpec]:
 
 def traffic(seed: int) -> list[tuple[int, int, Frame]]:
     """Time, port, frame: SYNC, status, positions that go up and down, torques; some on both sides at one instant."""
-    chance = random.Random(seed)  # noqa: S311 (only wants to be the same again)
+    chance = random.Random(seed)
     rows: list[tuple[int, int, Frame]] = []
     for cycle in range(CYCLES):
         at = cycle * CYCLE

@@ -204,7 +204,7 @@ def test_switches_and_triggers_reach_the_engine() -> None:
     ("fault", "target", "message"),
     [
         ("{type: stuk_at}", POSITION, ["a.fault.type: unknown fault 'stuk_at'; did you mean 'stuck_at'?", "bit_flip"]),
-        ("{type: no_ack}", POSITION, ["a.target.signal: wire faults act on frames, not on what is in them; leave signal out"]),
+        ("{type: no_ack}", POSITION, ["a.target.signal: wire faults act on frames, not on what is in them"]),
         ("{value: 2}", POSITION, ["a.fault.type: missing; allowed: stuck_at, stuck_at_value, package_drop"]),
         ("stuck_at", POSITION, ["a.fault: expected a mapping with type: stuck_at | ", "got 'stuck_at'"]),
         ("{type: stuck_at, value: 1 deg}", POSITION, ["a.fault.value: stuck_at has no such key (allowed: type)"]),

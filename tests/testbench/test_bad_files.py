@@ -77,8 +77,7 @@ TABLE: list[tuple[str, ...]] = [
     ("signal the other way", "to_controller", "§to_drives", "position of right_knee does not travel to_drives"),
     ("unknown direction", "to_controller", "§to_master", "unknown bus 'to_master'", "to_controller, to_drives, both"),
     ("unknown fault", "stuck_at}", "§stuckat}", "unknown fault 'stuckat'", "did you mean 'stuck_at'", "bit_flip"),
-    ("wire fault on a signal", "signal: position}\n    fault: {type: stuck_at}", "signal: §position}\n    fault: {type: no_ack}",
-     "wire faults act on frames", "leave signal out"),
+    ("payload fault on a bus", "{bus: to_controller,", "{wire: §drive, bus: both,", "only wire faults (bit_error"),
     ("whole-frame fault on a signal", "stuck_at}", "§drop}", "drop loses whole frames", "give pdo instead of position"),
     ("unknown trigger", "[freeze]", "[§freze]", "no injector is called 'freze'", "did you mean 'freeze'", "zero"),
     (

@@ -25,6 +25,16 @@ COUNTS = {
         "impostor": {"seen": 100, "inserted": 100, "changed": 0},
         "stop_knee": {"seen": 1, "inserted": 1},
     },
+    "disturbed_bits": {
+        "flipped_bit": {"seen": 0, "changed": 0},
+        "forged_position": {"seen": 5, "changed": 5},
+        "local_error": {"seen": 0, "changed": 0},
+        "unheard": {"seen": 0, "changed": 0},
+        "short_circuit": {"seen": 0, "changed": 0},
+    },
+    "noisy_wires": {"noise": {"seen": 0}, "bursts": {"seen": 0}},
+    "knee_bus_off": {"knee_off": {"seen": 0, "inserted": 0}},
+    "babbling_idiot": {"babble": {"seen": 0, "changed": 0}},
 }
 
 
