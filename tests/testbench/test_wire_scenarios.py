@@ -141,7 +141,7 @@ def test_a_drive_that_goes_bus_off_says_8140_and_the_controller_ends_the_motion(
 
 
 def test_a_drive_that_stays_bus_off_is_lost_by_its_heartbeat() -> None:
-    """Without an end its CAN controller is never asked to restart. (From power-up: the end of the motion ends others.)"""
+    """Without an end it is never asked to restart. (From power-up: the end of the motion would end it.)"""
     more = "effect: {type: infinite}, from: power_up"
     off = injector("off", "{node: left_knee}", "{type: bus_off}", "{type: at, time: 2.2 s}", more)
     document = run_scenario(scenario_of(off)).document
