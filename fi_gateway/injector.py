@@ -65,6 +65,7 @@ _INJECTOR_STATE: Final = (
     "_recent",
     "_instant_ns",
     "_arrived",
+    "_used_ns",
 )
 """What `__reduce__` copies besides the constructor arguments."""
 
@@ -199,6 +200,7 @@ class Injector:
         self._recent: Activation | None = None
         self._instant_ns: int = -NEVER
         self._arrived: int = 0
+        self._used_ns: int = -NEVER
 
     @property
     def port(self) -> int:
@@ -238,17 +240,17 @@ class Injector:
         if self.phase is not SPENT:
             self.phase, self.next_ns = INERT, NEVER
 
-    def open(self, now: int, cause: str, is_arriving: bool = False) -> Activation | None:
+    def open(self, now: int, cause: str, is_met: bool = False) -> Activation | None:
         """Open the window at `now`; None when the fault has to wait. For a waiting one the first cause stays.
 
-        is_arriving: with a target frame that is to be met. Without one, a window that opens when a target frame has
-        passed in this instant starts with the next one.
+        is_met: with a target frame that has just reached it. Without one, a window that opens when a target frame has
+        passed in this instant, or with which the last one ended, starts with the next one.
         """
         if self.phase is not WAITING:
             self._cause, self._due_ns = cause, now
         start_ns = now if now > self._due_ns else self._due_ns  # a frame stamped before a command, read after it
         passed = self._arrived if self._instant_ns == start_ns else 0
-        if passed and not is_arriving:
+        if start_ns < self.end_ns or (passed and not is_met):
             start_ns, passed = start_ns + 1, 0
         stream = state_of(self._fault_rng)
         if not self._fault.begin(start_ns, self.held, self._fault_rng):
@@ -292,6 +294,7 @@ class Injector:
         if self.wire is not None:
             return frame
         current.frames_seen += 1
+        self._used_ns = now
         fault = self._fault
         if not fault.fits(frame):
             current.frames_unfit += 1
@@ -334,6 +337,7 @@ class Injector:
         self.wake_ns = fault.wake_at
         if not tray.used:
             return
+        self._used_ns = now
         if self._repair is not None:
             self._repaired(None, None, tray)
         count = len(tray.inserted) + len(tray.late)
@@ -387,6 +391,8 @@ class Injector:
         self._fault.bound(end_ns)
         self._fault.end()
         end_ns = end_ns if end_ns > current.start_ns else current.start_ns
+        if end_ns == self._used_ns:  # it has met, or inserted, a frame in that very instant
+            end_ns += 1
         current.end_ns = end_ns
         current.saturated = self._fault.saturated
         if self.wire is not None:
@@ -422,7 +428,7 @@ class Injector:
 
     def _is_due(self, now: int, starts: bool, ends: bool) -> bool:
         """Note that the window opens, or ends, at `now`; whether it does."""
-        if (starts and self.phase is ARMED) or (ends and self.phase is ACTIVE):
+        if (starts and self.phase is ARMED and now >= self.end_ns) or (ends and self.phase is ACTIVE):
             self.next_ns = now if now < self.next_ns else self.next_ns
             return True
         return False

@@ -143,15 +143,15 @@ class Passage:
             left: Frame | None = frame
             is_held = False
             if injector.watches_target and injector.observe_target(now, frame):
-                self._settle(now, [injector])
+                self._settle(now, [], injector)
                 self.plan()
             injector.arrive(now)
             if injector.phase is ACTIVE:
                 left = injector.act(now, port, frame, self._tray)
-                if injector.has_news:
-                    is_held = self._carry_out(now, port, injector, left is None)
             if len(frame.data) >= injector.least_bytes:
                 injector.held[frame.can_id] = frame
+            if injector.has_news:
+                is_held = self._carry_out(now, port, injector, left is None)
             if injector.lines and left is not None:
                 is_held = self._queue(port, injector, frame, left)
                 left = None if is_held else left
@@ -254,10 +254,10 @@ class Passage:
                 if injector.has_news:
                     self._carry_out(now, injector.port, injector, False)
 
-    def _settle(self, now: int, arriving: list[Injector]) -> None:
+    def _settle(self, now: int, arriving: list[Injector], met: Injector | None = None) -> None:
         """Windows, the faults that want to be woken now, and what is to be said about them on the bus."""
         windows = self.windows
-        windows.settle(now, arriving)
+        windows.settle(now, arriving, met)
         said, windows.said = windows.said, []
         if windows.opened or said:
             self.speaks = True

@@ -179,8 +179,11 @@ class Windows:
         self.settle(now, [])
         link.fired = False
 
-    def settle(self, now: int, arriving: list[Injector]) -> None:
-        """Close and open what is due at `now`. arriving: the injectors that the frame of this instant will reach."""
+    def settle(self, now: int, arriving: list[Injector], met: Injector | None = None) -> None:
+        """Close and open what is due at `now`.
+
+        arriving: the injectors that the frame of this instant will reach; met: the one that it has just reached.
+        """
         self._settled_ns = now
         for link in self._links:
             injector = link.injector
@@ -194,7 +197,7 @@ class Windows:
                 cause = "frame"
             link.forget(now)
             if cause:
-                opened = injector.open(now, cause, injector in arriving)
+                opened = injector.open(now, cause, injector is met)
                 if opened is not None:
                     self.records.append(opened)
                     if self.keeps_opened:
