@@ -267,9 +267,9 @@ def answer_request(
     return {"ok": True, "done": done, "time_ns": now}
 
 
-def ask_to_add(address: str, name: str, injector: object, at_once: bool) -> None:
-    """Give a running gateway one more injector, with the keys of a scenario file. Raises FaultError."""
-    _ask(address, {"do": ADD, "name": name, "injector": injector, "at_once": at_once}, 2.0)
+def ask_to_add(address: str, name: str, injector: object, at_once: bool) -> Answer:
+    """Give a running gateway one more injector, with the keys of a scenario file. As `ask`."""
+    return _ask(address, {"do": ADD, "name": name, "injector": injector, "at_once": at_once}, 2.0)
 
 
 def ask(address: str, word: str, name: str = "", timeout_s: float = 2.0) -> Answer:

@@ -6,9 +6,10 @@
         exo.expect(0x085, within="100 ms", data="50 82 .. .. .. .. .. ..")
 
 Nothing moves unless the test lets it (`run_for`, `run_until`, `expect`) in lock-step; on any other bus time goes on by
-itself, and the frames of meanwhile are read at the next of these calls, before it begins: what it waits for or excludes
-are frames that end after the call, by their time, however late they are read. Durations are texts with a unit,
-"0.3 s", or control cycles, "15 cycles".
+itself, and the frames of meanwhile are read at the next of these calls. Frames count by their time, however late they
+are read: those that end after the call. An `expect` behind a `send`, or a fault that was begun or ended, counts from
+there, for the answer may be on the bus before the next line of the test runs. Durations are texts with a unit, "0.3 s",
+or control cycles, "15 cycles".
 """
 
 import re
@@ -219,7 +220,8 @@ class Exo:
         """
         __tracebackhide__ = True
         wanted = Wanted(cob_id, data, bus_index(bus))
-        found, missed = self._await(wanted, within)
+        from_ns, limit_ns = self._window(within)
+        found, missed = self._await(wanted, self._since(from_ns), limit_ns)
         if found is None:
             when = f"within {within}, until {self.time_s:.6f} s"
             if missed:
@@ -234,7 +236,7 @@ class Exo:
         """
         __tracebackhide__ = True
         wanted = Wanted(cob_id, data, bus_index(bus))
-        found, missed = self._await(wanted, within)
+        found, missed = self._await(wanted, *self._window(within))
         if found is None and missed:
             raise BenchError(
                 f"expect_none: {missed} frames were not heard within {within}, {wanted.words} can be one of them; the "
@@ -299,13 +301,16 @@ class Exo:
         if span < 0:
             raise BenchError(f"duration {duration!r} given, allowed 0 s and more")
         self._start()
-        self._catch_up()
         now = self.time_ns
+        self._catch_up()
         return now, now + span
 
-    def _await(self, wanted: Wanted, within: str) -> tuple[Transmission | None, int]:
-        """Run until the first such frame that ends within that time; also how many frames were not heard meanwhile."""
-        from_ns, limit_ns = self._window(within)
+    def _since(self, now: int) -> int:
+        """From when on a frame may be the answer to what the test did last: `now` where time is virtual."""
+        return now
+
+    def _await(self, wanted: Wanted, from_ns: int, limit_ns: int) -> tuple[Transmission | None, int]:
+        """Run until the first such frame that ends in that time; also how many frames were not heard meanwhile."""
         missed = self.missed
         search = Search(wanted, self.rows, from_ns, limit_ns)
         self._advance(limit_ns, search.is_over, every_frame=True)

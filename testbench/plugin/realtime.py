@@ -18,7 +18,7 @@ from canopen_exo.bus.frame import Frame
 from canopen_exo.bus.medium import Transmission
 from canopen_exo.bus.node import MS, NEVER, SECOND
 from fi_gateway.control import InjectorRow
-from fi_gateway.control_socket import ask, ask_listing, ask_to_add
+from fi_gateway.control_socket import Answer, ask, ask_listing, ask_to_add
 from fi_gateway.errors import FaultError
 from testbench.errors import BenchError
 from testbench.merge import merge
@@ -40,10 +40,11 @@ _SENDING_NS: Final = SECOND
 
 @final
 class RealTimeGateway(GatewayControl):
-    """The gateway process of a real-time rig, by its live control."""
+    """The gateway process of a real-time rig, by its live control. acted_ns: when it last did a word, rig's clock."""
 
     def __init__(self, scenario: Scenario) -> None:
         super().__init__(scenario)
+        self.acted_ns: int = 0
         self._address: str = ""
 
     def connect(self, rig: Supervisor) -> None:
@@ -58,17 +59,23 @@ class RealTimeGateway(GatewayControl):
         """A word of live control. Raises FaultError."""
         if not self._address:
             raise FaultError(NOT_RUN.format(what=f"{word} {name}".strip()))
-        ask(self._address, word, name)
+        self._note(ask(self._address, word, name))
 
     def _add(self, name: str, given: Part, at_once: bool) -> None:
         before = self.additions.specs
         self.additions.read(name, given)
         if self._address:
             try:
-                ask_to_add(self._address, name, given, at_once)
+                self._note(ask_to_add(self._address, name, given, at_once))
             except FaultError:
                 self.additions.specs = before
                 raise
+
+    def _note(self, answer: Answer) -> None:
+        """Processes of a rig share their clock."""
+        time_ns = answer.get("time_ns")
+        if isinstance(time_ns, int):
+            self.acted_ns = time_ns
 
 
 @final
@@ -90,6 +97,8 @@ class RealTimeExo(Exo):
         self._rig: Supervisor | None = None
         self._rows: list[Transmission] = []
         self._heard: int = 0
+        self._sent_ns: int = 0
+        self._waited_ns: int = 0  # when the last wait for frames ended
         self._seen: int = 0
         self._newest: Final[list[int]] = [0, 0]  # latest end of a frame among the rows seen, by bus [ns]
         self._senders: Final[dict[int, Channel]] = {}
@@ -162,7 +171,12 @@ class RealTimeExo(Exo):
             self._read_to(limit_ns, look)
         if not found:
             self._catch_up()
+        self._waited_ns = rig.now()
         return found
+
+    def _since(self, now: int) -> int:
+        acted_ns = max(self._sent_ns, self._injectors.acted_ns)
+        return min(now, acted_ns) if acted_ns >= self._waited_ns else now
 
     def _read_to(self, limit_ns: int, look: Callable[[], bool]) -> None:
         """Read what ended by the limit and has not come yet, until `look()` gives True."""
@@ -217,6 +231,7 @@ class RealTimeExo(Exo):
         if channel is None:
             channel = self._senders[bus] = open_bus(rig.buses[bus])
         channel.receive()  # nobody else reads from it
+        self._sent_ns = rig.now()
         lost = channel.lost
         limit = rig.now() + _SENDING_NS
         if not channel.send(frame):

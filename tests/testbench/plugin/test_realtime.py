@@ -5,12 +5,14 @@ from typing import cast
 
 import pytest
 
+from canopen_exo.bus.channel import Channel
 from canopen_exo.bus.frame import Frame
 from canopen_exo.bus.medium import Transmission
 from canopen_exo.bus.node import MS
 from canopen_exo.plan import HEARTBEAT, SYNC
 from testbench.cli_rig import DEFAULT_SCENARIO
 from testbench.errors import BenchError
+from testbench.plugin import realtime
 from testbench.plugin.golden import Goldens
 from testbench.plugin.realtime import RealTimeExo
 from testbench.scenario import parse_scenario
@@ -75,6 +77,20 @@ class Rig:
             self.poll()
 
 
+class Sender:
+    """The interface of the test's own frames."""
+
+    name = "sender"
+    lost = 0
+
+    def receive(self) -> None:
+        """Nothing comes."""
+
+    def send(self, frame: Frame) -> bool:
+        """It is taken."""
+        return True
+
+
 @pytest.fixture
 def rig() -> Rig:
     return Rig()
@@ -113,13 +129,42 @@ def test_a_test_without_a_turn_judges_what_was_on_the_bus(rig: Rig, exo: RealTim
         lambda: exo.expect(WANTED, within="50 ms"),
         lambda: exo.expect_none(WANTED + 1, within="50 ms"),
     ):
-        saved = (rig._now, list(rig._coming), list(rig.rows), exo._heard, exo._seen)
+        saved = (rig._now, list(rig._coming), list(rig.rows), exo._heard, exo._seen, list(exo._newest))
         rig.stall_ns, rig.stall_after = 200 * MS, after
         call()
-        rig._now, rig._coming, rig.rows[:], exo._heard, exo._seen = saved
+        rig._now, rig._coming, rig.rows[:], exo._heard, exo._seen, exo._newest[:] = saved
     rig.stall_ns, rig.stall_after = 200 * MS, after
     with pytest.raises(AssertionError, match="was not to come within 50 ms"):
         exo.expect_none(WANTED, within="50 ms")
+
+
+def test_the_answer_to_a_frame_of_the_test_may_be_there_before_the_test_looks(rig: Rig, exo: RealTimeExo) -> None:
+    """A stall between `send` and `expect` loses no answer; with the next wait what was sent is past."""
+    exo.run_for("100 ms")
+    exo._senders[1] = cast(Channel, Sender())
+    rig.put(rig.now() - MS, WANTED, b"early")
+    exo.send(0x605, b"12345678", bus="drive")
+    rig.put(rig.now() + MS, WANTED, b"answer")
+    rig.sleep(200 * MS)
+    assert exo.expect(WANTED, within="10 ms").frame.data == b"answer"
+    rig.put(rig.now() + MS, WANTED)
+    rig.sleep(200 * MS)
+    with pytest.raises(AssertionError, match="no frame 185"):
+        exo.expect(WANTED, within="10 ms")
+
+
+def test_the_answer_to_a_fault_counts_from_the_gateways_time(
+    rig: Rig, exo: RealTimeExo, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not from the return of the call, which may be late, and not before the fault acts."""
+    exo._injectors._address = "127.0.0.1:1"
+    monkeypatch.setattr(realtime, "ask", lambda address, word, name: {"ok": True, "time_ns": 30 * MS})
+    exo.run_for("20 ms")
+    rig.put(28 * MS, WANTED, b"early")
+    rig.put(35 * MS, WANTED, b"fault")
+    exo.gateway.stop()
+    rig.sleep(200 * MS)
+    assert exo.expect(WANTED, within="10 ms").frame.data == b"fault"
 
 
 def test_a_frame_that_a_busy_hub_brings_after_the_limit_counts_by_its_time(rig: Rig, exo: RealTimeExo) -> None:
