@@ -44,7 +44,7 @@ class Readers:
     def turn(self, timeout_s: float = PATIENCE_S) -> bool:
         """Serve what is readable; False when nothing was."""
         readable, _, _ = select.select(list(self.callbacks), [], [], timeout_s)
-        self.now += 1
+        self.now += bool(readable)
         for fd in readable:
             if fd in self.callbacks:
                 self.callbacks[fd][1](self.now)

@@ -495,6 +495,7 @@ def test_rogue_that_never_reads_what_it_has_sent_cannot_fill_the_memory() -> Non
         while hub.wake_at != NEVER:
             now = hub.wake_at
             hub.wake(now)
+            hub.settle(now)
     assert len(rogue.outbox) <= OUTBOX_LIMIT + 24
     told = records(rogue)[filler:]
     hub.drained(rogue)
