@@ -3,7 +3,9 @@
 A request is an object with `do` (arm, disarm, trigger, start, stop, resume, list, add) and `name` for those about one
 injector; add has its keys in `injector`, and `at_once` true where its times count from now. An answer has `ok`, and
 `error` when that is false (docs/live_control.md). The server is a further reader of the real-time loop: a request is
-handled between two frames, one read of at most 4096 bytes at a time, and nothing here ever blocks.
+handled between two frames, at most one of each client in a turn of the loop, and nothing here ever blocks. What a
+client sends beyond that waits in its socket. Where one client too many comes, the one idle for longest is let go, so
+that nobody can keep others from `stop`; a client that asks nothing for IDLE_NS is let go too.
 Addresses: `HOST:PORT`, or a path (with a `/` in it) for a Unix socket, which only the same user can open.
 Safety: on loopback any local user, and so any page in a browser, can connect to a TCP port. A connection whose line is
 no JSON object is told so and closed, which ends an HTTP request at its first line; nothing is ever done for it.
@@ -22,7 +24,7 @@ from pathlib import Path
 from typing import Final, Protocol, final
 
 from canopen_exo.bus.lateness import Lateness
-from canopen_exo.bus.node import NEVER
+from canopen_exo.bus.node import NEVER, SECOND
 from canopen_exo.errors import CanopenExoError
 from fi_gateway.control import (
     ADD,
@@ -43,10 +45,14 @@ LIST: Final = "list"
 MAX_LINE: Final = 4096
 """Bytes of a request, its line feed included."""
 MAX_CLIENTS: Final = 16
+IDLE_NS: Final = 300 * SECOND
+"""A connection over which nothing was asked for so long is closed."""
 _BACKLOG: Final = 4
 _SEND_BUFFER: Final = 1 << 20
 """A listing is about 150 bytes for each injector; a client that lets this fill up is let go."""
 _MAX_ANSWER: Final = 1 << 20
+_DISCARDED: Final = 1 << 16
+"""Bytes taken unread from a client that is let go."""
 
 Answer = dict[str, object]
 
@@ -63,10 +69,11 @@ class Readers(Protocol):
 
 @final
 class _Client:
-    """A connection and what has come of its next line."""
+    """A connection and what has come of its next line. asked_ns: when it came or last asked for something."""
 
-    def __init__(self, link: socket.socket) -> None:
+    def __init__(self, link: socket.socket, now: int) -> None:
         self.link: Final[socket.socket] = link
+        self.asked_ns: int = now
         self.line: bytes = b""
 
 
@@ -87,6 +94,7 @@ class ControlServer:
         self._path: Path | None = None
         self._readers: Readers | None = None
         self._clients: Final[list[_Client]] = []
+        self._tidy_at: int = 0
 
     @property
     def address(self) -> str:
@@ -106,7 +114,7 @@ class ControlServer:
     def listen(self) -> None:
         """Bind; raises FaultError, saying what to do."""
         try:
-            if _is_path(self._address):
+            if is_path(self._address):
                 self._listen_on_path(Path(self._address))
             else:
                 host, port = _split(self._address)
@@ -145,9 +153,7 @@ class ControlServer:
 
     def _listen_on_path(self, path: Path) -> None:
         """A Unix socket that is ours alone; one that a killed process has left is taken over."""
-        with contextlib.suppress(FileNotFoundError):
-            if stat.S_ISSOCK(path.lstat().st_mode) and not _is_alive(path):
-                path.unlink()
+        remove_left(path)
         listener = _unix_socket()
         self._listener = listener
         listener.bind(str(path))
@@ -162,14 +168,20 @@ class ControlServer:
         except OSError:  # it has left already, or we are out of file descriptors
             return
         if len(self._clients) >= MAX_CLIENTS:
-            link.close()
-            return
+            self._drop(min(self._clients, key=_idle_since))
         link.setblocking(False)
         with contextlib.suppress(OSError):
             link.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
-        client = _Client(link)
+        client = _Client(link, now)
         self._clients.append(client)
         self._readers.add_reader(link, partial(self._read, client))
+
+    def tidy(self, now: int) -> None:
+        """Let those go that have asked nothing for long; to be called now and then. now: loop clock [ns]."""
+        if now >= self._tidy_at:
+            for client in [one for one in self._clients if one.asked_ns + IDLE_NS <= now]:
+                self._drop(client)
+            self._tidy_at = now + SECOND
 
     def _drop(self, client: _Client) -> None:
         self._clients.remove(client)
@@ -178,9 +190,10 @@ class ControlServer:
         client.link.close()
 
     def _read(self, client: _Client, now: int) -> None:
-        """Read once, and answer every whole line."""
+        """Take the rest of one line, and answer it; further lines stay in the socket until the next turn."""
         try:
-            got = client.link.recv(MAX_LINE)
+            seen = client.link.recv(MAX_LINE, socket.MSG_PEEK)
+            got = client.link.recv(seen.find(b"\n") + 1 or len(seen)) if seen else seen
         except BlockingIOError:
             return
         except OSError:
@@ -188,21 +201,24 @@ class ControlServer:
         if not got:
             self._drop(client)
             return
-        *lines, client.line = (client.line + got).split(b"\n")
-        keep = True
-        for line in lines:
-            request = _object(line) if len(line) < MAX_LINE else None
-            keep = request is not None
+        client.line += got
+        if len(client.line) > MAX_LINE or (len(client.line) == MAX_LINE and not got.endswith(b"\n")):
+            self._dismiss(client, f"a request has at most {MAX_LINE} bytes; closing")
+        elif got.endswith(b"\n"):
+            request = _object(client.line)
+            client.line = b""
+            client.asked_ns = now
             if request is None:
-                answer: Answer = {"ok": False, "error": "not a line with one JSON object; closing"}
-            else:
-                answer = answer_request(self._control, request, now, self._latency)
-            if not (self._send(client, answer) and keep):
+                self._dismiss(client, "not a line with one JSON object; closing")
+            elif not self._send(client, answer_request(self._control, request, now, self._latency)):
                 self._drop(client)
-                return
-        if len(client.line) >= MAX_LINE:
-            self._send(client, {"ok": False, "error": f"a request has at most {MAX_LINE} bytes; closing"})
-            self._drop(client)
+
+    def _dismiss(self, client: _Client, why: str) -> None:
+        """Say why, and close. What it has sent already is thrown away, or closing would reset the connection."""
+        self._send(client, {"ok": False, "error": why})
+        with contextlib.suppress(OSError):
+            client.link.recv(_DISCARDED)
+        self._drop(client)
 
     def _send(self, client: _Client, answer: Answer) -> bool:
         """False when the client does not take it."""
@@ -251,9 +267,9 @@ def answer_request(
     return {"ok": True, "done": done, "time_ns": now}
 
 
-def ask_to_add(address: str, name: str, injector: object, at_once: bool) -> None:
-    """Give a running gateway one more injector, with the keys of a scenario file. Raises FaultError."""
-    _ask(address, {"do": ADD, "name": name, "injector": injector, "at_once": at_once}, 2.0)
+def ask_to_add(address: str, name: str, injector: object, at_once: bool) -> Answer:
+    """Give a running gateway one more injector, with the keys of a scenario file. As `ask`."""
+    return _ask(address, {"do": ADD, "name": name, "injector": injector, "at_once": at_once}, 2.0)
 
 
 def ask(address: str, word: str, name: str = "", timeout_s: float = 2.0) -> Answer:
@@ -361,7 +377,12 @@ def _shown(given: object) -> str:
     return text if len(text) <= 60 else f"{text[:60]}..."
 
 
-def _is_path(address: str) -> bool:
+def _idle_since(client: _Client) -> int:
+    return client.asked_ns
+
+
+def is_path(address: str) -> bool:
+    """Whether an address is that of a Unix socket."""
     return "/" in address
 
 
@@ -378,7 +399,7 @@ def _split(address: str) -> tuple[str, int]:
 
 def _connect(address: str, timeout_s: float) -> socket.socket:
     """A connection; raises OSError, and FaultError for an address that is none."""
-    if not _is_path(address):
+    if not is_path(address):
         return socket.create_connection(_split(address), timeout=timeout_s)
     link = _unix_socket()
     link.settimeout(timeout_s)
@@ -394,6 +415,13 @@ def _unix_socket() -> socket.socket:
     if not hasattr(socket, "AF_UNIX"):
         raise FaultError(f"live control: this system has no Unix sockets; use HOST:PORT, such as {DEFAULT_ADDRESS}")
     return socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+
+
+def remove_left(path: Path) -> None:
+    """Remove a socket that nobody listens at any more, as a killed process leaves it; anything else stays."""
+    with contextlib.suppress(FileNotFoundError):
+        if stat.S_ISSOCK(path.lstat().st_mode) and not _is_alive(path):
+            path.unlink()
 
 
 def _is_alive(path: Path) -> bool:

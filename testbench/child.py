@@ -23,14 +23,17 @@ class ProcessError(BenchError):
 
 @final
 class Process:
-    """A running process. name: hub or one of PARTS; lines: the last ones it printed. Its output is read by `listen`."""
+    """A running process. name: hub or one of PARTS; lines: the last ones it printed. Its output is read by `listen`.
 
-    def __init__(self, name: str, arguments: list[str], say: Callable[[str], None]) -> None:
+    say: told each line as it comes, None where nobody shows them.
+    """
+
+    def __init__(self, name: str, arguments: list[str], say: Callable[[str], None] | None) -> None:
         self.name: Final[str] = name
         self.lines: Final[deque[str]] = deque(maxlen=_LAST_LINES)
         self.is_told: bool = False
         self._first: Final[list[str]] = []
-        self._say: Final[Callable[[str], None]] = say
+        self._say: Final[Callable[[str], None] | None] = say
         self._rest: bytes = b""
         self._is_closed: bool = False
         self._running: Final[subprocess.Popen[bytes]] = subprocess.Popen(
@@ -78,7 +81,8 @@ class Process:
                 self.lines.append(text)
                 if len(self._first) < _LAST_LINES:
                     self._first.append(text)
-                self._say(text)
+                if self._say is not None:
+                    self._say(text)
             if not data:
                 return False
         return False
@@ -108,7 +112,7 @@ class Process:
         self._running.stdout.close()
 
     def obituary(self) -> str:
-        """How it ended, and what it said last."""
+        """How it ended, and what it said last, unless that was shown when it was said."""
         code = self.code
         if not self._is_closed:
             self.listen()
@@ -118,5 +122,5 @@ class Process:
             how = f"was killed by {signal.Signals(-code).name}"
         else:
             how = f"ended with exit code {code}"
-        said = "".join(f"\n  {line}" for line in self.lines)
+        said = "" if self._say is not None else "".join(f"\n  {line}" for line in self.lines)
         return f"{self.name} {how}{'; its last lines:' + said if said else ''}"

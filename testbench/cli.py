@@ -1,7 +1,7 @@
 """The command line: `exo-hil`.
 
-stdout carries the result, stderr the talk. Exit codes: 0 pass, 1 verdict fail, 2 usage or bad file, 3 run invalid.
-Everything heavy is imported by the verb that needs it.
+stdout carries the result, stderr the talk. Exit codes: 0 pass, 1 verdict fail, 2 usage or bad file, 3 run invalid,
+130 interrupted. Everything heavy is imported by the verb that needs it.
 """
 
 import argparse
@@ -57,7 +57,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="exo-hil",
         description="CAN-bus hardware-in-the-loop emulator of a lower-limb exoskeleton with wire-level fault injection",
-        epilog="Exit codes: 0 pass, 1 verdict fail, 2 usage or bad file, 3 run invalid.",
+        epilog="Exit codes: 0 pass, 1 verdict fail, 2 usage or bad file, 3 run invalid, 130 interrupted.",
     )
     parser.add_argument("--version", action=_Version, nargs=0, help="print the version and leave")
     verbs = parser.add_subparsers(title="verbs", metavar="VERB", required=True)

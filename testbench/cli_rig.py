@@ -24,6 +24,7 @@ INVALID: Final = 3
 PARTS: Final = ("joints", "gateway", "hlc")
 
 HUB_ADDRESS: Final = "127.0.0.1:29536"
+HUB_BITRATE: Final = 1_000_000
 CONTROL_ADDRESS: Final = "127.0.0.1:29537"
 NAMED: Final = ("arm", "disarm", "trigger")
 UNNAMED: Final = ("start", "stop", "resume")
@@ -102,7 +103,7 @@ def add_verbs(verbs: Verbs) -> None:
         "--listen", metavar="HOST:PORT", default=HUB_ADDRESS, help="port 0: a free one (default: %(default)s)"
     )
     hub.add_argument("--timed", action="store_true", help="with bit time and arbitration of a real bus")
-    hub.add_argument("--bitrate", type=int, default=1_000_000, metavar="N", help="with --timed (default: %(default)s)")
+    hub.add_argument("--bitrate", type=int, metavar="N", help=f"with --timed, bit/s (default: {HUB_BITRATE})")
     hub.add_argument("--errors", action="store_true", help="with --timed: acknowledgement, error frames, error states")
     hub.add_argument("--bit-error-rate", type=float, metavar="R", help="with --errors: noise, flips per bit")
     hub.add_argument("--seed", type=int, default=1, metavar="N", help="of the noise (default: %(default)s)")
@@ -276,7 +277,11 @@ def _hub(options: argparse.Namespace) -> int:
     try:
         if options.supervisor:
             die_with(options.supervisor)
-        return hub_main(options.listen, options.timed, options.bitrate, _bus_maker(options))
+        bitrate = options.bitrate
+        if bitrate is not None and not options.timed:
+            raise BenchError(f"--bitrate {bitrate} is given without --timed: a fast hub has no bit time; add --timed")
+        bitrate = HUB_BITRATE if bitrate is None else bitrate
+        return hub_main(options.listen, options.timed, bitrate, _bus_maker(options))
     except BenchError as error:
         print(f"hub: {error}", file=sys.stderr)
         return USAGE

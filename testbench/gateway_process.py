@@ -67,7 +67,7 @@ def gateway_main(
                 if server.is_exposed:
                     say("gateway", f"warning: {server.address} can be reached from other machines")
             say("gateway", f"between {buses[0]} (controller) and {buses[1]} (drives); {_injectors_text(gateway)}")
-            _serve(process, control, server is not None or given.frames is not None)
+            _serve(process, control, server, server is not None or given.frames is not None)
         gateway.finish(process.loop.now())
         if options.part is not None:
             _leave_part(options, process, control)
@@ -122,13 +122,15 @@ def active_faults(address: str) -> list[str]:
     return [row.name for row in listing.injectors if row.state == Phase.ACTIVE.value]
 
 
-def _serve(process: Session, control: LiveControl, can_resume: bool) -> None:
+def _serve(process: Session, control: LiveControl, server: ControlServer | None, can_resume: bool) -> None:
     """Until told to end. can_resume: there is live control to resume injection with."""
     interrupted = False
     how = "`exo-hil fault resume` resumes" if can_resume else "nothing resumes it without --control"
 
     def is_over(now: int) -> bool:
         nonlocal interrupted
+        if server is not None:
+            server.tidy(now)
         orders = process.orders
         if orders.interrupts and not interrupted:
             interrupted = True

@@ -23,7 +23,9 @@ from canopen_exo.bus.channel import Channel
 from canopen_exo.bus.medium import Transmission
 from canopen_exo.bus.node import MS, NEVER, SECOND
 from canopen_exo.bus.realtime import RealTimeLoop
+from fi_gateway.control_socket import is_path, remove_left
 from testbench.child import Process, ProcessError
+from testbench.errors import BenchError
 from testbench.process import DONE, ENDED_EARLY, Orders, open_bus
 from testbench.scenario import Scenario
 from testbench.watch import CONTROLLER_PORT, DRIVE_PORT, Watch
@@ -46,6 +48,9 @@ END_NS: Final = 10 * SECOND
 SAYS_HUB: Final = "listening on "
 SAYS_CONTROL: Final = "gateway: live control at "
 """How hub and gateway say where they listen."""
+
+REFUSED: Final = 2
+"""Exit code of a process that refuses what it was given: an address in use, a bus that is not there."""
 
 _LOOK_NS: Final = 20 * MS
 
@@ -76,14 +81,15 @@ class Supervisor:
     """A rig of processes; a context manager that leaves none behind.
 
     watch: the listener on both buses; processes: by name.
-    say: told each line that a process prints; tick: called with the loop's time at least every 50 ms;
+    say: told each line that a process prints, which its obituary then leaves out;
+    tick: called with the loop's time at least every 50 ms;
     announce: told what foreign software is waited for, and where; hub: of another supervisor, watched and not ended.
     """
 
     def __init__(
         self,
         setup: Setup,
-        say: Callable[[str], None] = lambda line: None,
+        say: Callable[[str], None] | None = None,
         tick: Callable[[int], None] = lambda now: None,
         announce: Callable[[str], None] = lambda text: None,
         hub: Process | None = None,
@@ -92,7 +98,7 @@ class Supervisor:
         self.watch: Final[Watch] = Watch(setup.scenario.plan)
         self.processes: Final[dict[str, Process]] = {}
         self.orders: Final[Orders] = Orders()
-        self._say: Final[Callable[[str], None]] = say
+        self._say: Final[Callable[[str], None] | None] = say
         self._tick: Final[Callable[[int], None]] = tick
         self._announce: Final[Callable[[str], None]] = announce
         self._borrowed: Final[list[Process]] = [] if hub is None else [hub]
@@ -119,6 +125,7 @@ class Supervisor:
             for process in reversed(self.processes.values()):
                 process.close()
             self._close_channels()
+            self._remove_control()
             self._cleaning.close()
 
     # --- what a run does -----------------------------------------------------------------------------------------
@@ -126,7 +133,8 @@ class Supervisor:
     def start(self, parts: Sequence[str] = PARTS) -> None:
         """Start hub and parts, in order; those that are foreign are waited for all the same, except the controller.
 
-        Raises ProcessError, BenchError for a bus that cannot be opened, KeyboardInterrupt when asked to end meanwhile.
+        Raises ProcessError, BenchError for a bus that cannot be opened or a hub that cannot listen, KeyboardInterrupt
+        when asked to end meanwhile.
         """
         setup = self.setup
         self._scenario_file.write_text(setup.scenario.resolved_yaml(), encoding="utf-8")
@@ -153,7 +161,13 @@ class Supervisor:
             self._idle(hub)
             self._hub_address = hub.said(SAYS_HUB)
             if not self._hub_address and (hub.code is not None or self.now() >= limit):
-                raise ProcessError(f"the hub does not listen: {hub.obituary()}")
+                why = f"the hub does not listen: {hub.obituary()}"
+                raise BenchError(why) if hub.code == REFUSED else ProcessError(why)
+
+    def poll(self) -> None:
+        """Hear what has come on the buses, without waiting."""
+        assert self._loop is not None
+        self._loop.poll()
 
     def run(self, until: Callable[[int], bool]) -> None:
         """Listen until `until(now)`. Raises ProcessError when a process ends unasked, KeyboardInterrupt."""
@@ -332,7 +346,7 @@ class Supervisor:
             raise KeyboardInterrupt
 
     def _mourn(self, dead: Process) -> None:
-        """Let the others react, then raise what is known about the dead."""
+        """Let the others react, then raise what is known about the dead; one that refused its place is no defect."""
         dead.is_told = True
         alarms = len(self.watch.alarms)
         died_at = self.now()
@@ -344,6 +358,8 @@ class Supervisor:
         if len(self.watch.alarms) > alarms:
             told = {f"{alarm.joint} {alarm.code:04X}" for alarm in self.watch.alarms[alarms:] if alarm.code}
             text += f"\nthe drives then reported: {', '.join(sorted(told))}"
+        if dead.code == REFUSED and not self._is_started:
+            raise BenchError(text)
         raise ProcessError(text)
 
     def _idle(self, process: Process) -> None:
@@ -355,6 +371,11 @@ class Supervisor:
         else:
             process.listen()
             process.wait(_LOOK_NS / SECOND)
+
+    def _remove_control(self) -> None:
+        """A gateway that was killed leaves the socket of its live control; in the rig's folder it goes with that."""
+        if "gateway" in self.processes and is_path(self.setup.control):
+            remove_left(Path(self.setup.control))
 
     def _close_channels(self) -> None:
         for channel in self._channels:

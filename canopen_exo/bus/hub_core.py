@@ -100,6 +100,12 @@ class Client:
             self.outbox.extend(pack_count(KIND_OVERRUN, LOST_SENDING, self.overflow))
             self.overflow = 0
 
+    def tell_sent(self) -> None:
+        """How many of its own frames have left, some at a time; put off while it does not read."""
+        if self.unconfirmed >= CONFIRM_EVERY and len(self.outbox) < OUTBOX_LIMIT:
+            self.outbox.extend(pack_count(KIND_SENT, 0, self.unconfirmed))
+            self.unconfirmed = 0
+
 
 class SharedBus:
     """One named bus. frames: carried; skipped: dropped for clients that did not read; most: clients at once;
@@ -294,9 +300,7 @@ class TimedBus(SharedBus):
             return
         if sender.options & OPTION_CONFIRM:
             sender.unconfirmed += 1
-            if sender.unconfirmed >= CONFIRM_EVERY:
-                sender.outbox.extend(pack_count(KIND_SENT, 0, sender.unconfirmed))
-                sender.unconfirmed = 0
+            sender.tell_sent()
         if sender.options & OPTION_OWN:
             own = pack_record(frame.can_id, frame.flags | FLAG_OWN, frame.dlc, frame.data, end)
             self.skipped += sender.offer(own, 1)
@@ -362,12 +366,13 @@ class Hub:
             client.bus.leave(client)
 
     def drained(self, client: Client) -> None:
-        """Its outbox has been written: what was dropped meanwhile is told now, if no later frame brought it."""
+        """Its outbox has been written: what was dropped or sent meanwhile is told, if no later frame brought it."""
         if client.bus is None:
             return
         if client.skipped:
             client.tell_overrun()
         client.tell_overflow()
+        client.tell_sent()
 
     def wake(self, now: int) -> None:
         """Deliver what has ended by `now`."""

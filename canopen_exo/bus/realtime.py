@@ -162,11 +162,15 @@ class RealTimeLoop:
             if collecting:
                 gc.enable()
 
-    def _turn(self) -> None:
-        """Wait once, then serve everything that is due."""
+    def poll(self) -> None:
+        """Serve once what is due and what has come, without waiting."""
+        self._turn(0)
+
+    def _turn(self, longest_ns: int = _CHECK_NS) -> None:
+        """Wait once, `longest_ns` at most, then serve everything that is due."""
         readers = list(self._readers)
         writers: list[int] = []
-        timeout_ns = self._prepare(self.now(), readers, writers)
+        timeout_ns = min(self._prepare(self.now(), readers, writers), longest_ns)
         readable, writable = self._wait(readers, writers, timeout_ns / SECOND)
         now = self._clock() - self.epoch_ns
         if self._relay is None:

@@ -6,8 +6,10 @@
         exo.expect(0x085, within="100 ms", data="50 82 .. .. .. .. .. ..")
 
 Nothing moves unless the test lets it (`run_for`, `run_until`, `expect`) in lock-step; on any other bus time goes on by
-itself, and the frames of meanwhile are read at the next of these calls. Durations are texts with a unit, "0.3 s", or
-control cycles, "15 cycles".
+itself, and the frames of meanwhile are read at the next of these calls. Frames count by their time, however late they
+are read: those that end after the call. An `expect` behind a `send`, or a fault that was begun or ended, counts from
+there, for the answer may be on the bus before the next line of the test runs. Durations are texts with a unit, "0.3 s",
+or control cycles, "15 cycles".
 """
 
 import re
@@ -168,16 +170,22 @@ class Exo:
         truth, elapsed_s = self._truth()
         return compare(names, self.golden.truth, truth, elapsed_s)[joint]
 
+    @property
+    def missed(self) -> int:
+        """Frames that were on a bus and not heard, because the test did not read in time; 0 where time is virtual."""
+        return 0
+
     # --- what a test does ----------------------------------------------------------------------------------------
 
     def run_for(self, duration: str) -> None:
         """Let the rig run: `exo.run_for("1.5 s")`."""
-        self._advance(self._limit(duration), None)
+        _, limit = self._window(duration)
+        self._advance(limit, None)
 
     def run_until(self, condition: Callable[[], bool], *, within: str) -> None:
         """Let the rig run until the condition, asked every 1 ms at least; AssertionError when it never holds."""
         __tracebackhide__ = True
-        limit = self._limit(within)
+        _, limit = self._window(within)
         if not condition() and not self._advance(limit, condition):
             raise AssertionError(f"the condition did not hold within {within}, until {self.time_s:.3f} s")
 
@@ -195,6 +203,7 @@ class Exo:
             return is_decided or self.master.state in (MasterState.FAILED, MasterState.STOPPED)
 
         self._start()
+        self._catch_up()
         if not is_over():
             self._advance(self.time_ns + START_NS + self.scenario.motion.stride_ns, is_over)
         if controller.state is not ControllerState.MOTION:
@@ -211,17 +220,28 @@ class Exo:
         """
         __tracebackhide__ = True
         wanted = Wanted(cob_id, data, bus_index(bus))
-        found = self._await(wanted, self._limit(within))
+        from_ns, limit_ns = self._window(within)
+        found, missed = self._await(wanted, self._since(from_ns), limit_ns)
         if found is None:
             when = f"within {within}, until {self.time_s:.6f} s"
+            if missed:
+                when += f" ({missed} frames of that time were not heard, the test did not read for too long)"
             raise AssertionError(f"no {self._words(wanted)} {when}{self._near(wanted)}")
         return found
 
     def expect_none(self, cob_id: int, *, within: str, data: bytes | str | None = None, bus: str = "drive") -> None:
-        """Let the rig run for that time; AssertionError when such a frame ends on the bus meanwhile."""
+        """Let the rig run for that time; AssertionError when such a frame ends on the bus meanwhile.
+
+        Raises BenchError when frames of that time were lost on the way to the test: it can have been among them.
+        """
         __tracebackhide__ = True
         wanted = Wanted(cob_id, data, bus_index(bus))
-        found = self._await(wanted, self._limit(within))
+        found, missed = self._await(wanted, *self._window(within))
+        if found is None and missed:
+            raise BenchError(
+                f"expect_none: {missed} frames were not heard within {within}, {wanted.words} can be one of them; the "
+                "test did not read for too long: expect less at once, or run it on a machine that is less busy"
+            )
         if found is not None:
             raise AssertionError(f"{self._words(wanted)} was not to come within {within}:\n{self.text_of(found)}")
 
@@ -255,8 +275,14 @@ class Exo:
         """Put the rig together and power it up, when that is not done yet."""
         raise NotImplementedError
 
+    def _catch_up(self) -> None:
+        """Take in what has come while the test did something else; nothing where time is virtual."""
+
     def _advance(self, limit_ns: int, is_over: Callable[[], bool] | None, every_frame: bool = False) -> bool:
-        """Run until `is_over()`, asked every 1 ms at least, or after every frame, and give True; False at the limit."""
+        """Run until `is_over()`, asked every 1 ms at least, or after every frame, and give True; False at the limit.
+
+        Frames count by the time at which they ended, not by that at which they are read.
+        """
         raise NotImplementedError
 
     def _send(self, bus: int, frame: Frame) -> None:
@@ -266,8 +292,8 @@ class Exo:
         """What the joints did from time 0 to the end of the motion or to now, and how long that is [s]."""
         raise NotImplementedError
 
-    def _limit(self, duration: str) -> int:
-        """The instant that long from now, in the time of the started rig [ns]."""
+    def _window(self, duration: str) -> tuple[int, int]:
+        """Now and the instant that long from now, in the time of the started rig [ns]; what came before is read."""
         if not isinstance(duration, str):  # a number of what? tests are not all type-checked
             raise BenchError(f"duration {duration!r} given, allowed is text with a unit: '0.1 s', '15 cycles'")
         cycles = _CYCLES.fullmatch(duration)
@@ -275,13 +301,20 @@ class Exo:
         if span < 0:
             raise BenchError(f"duration {duration!r} given, allowed 0 s and more")
         self._start()
-        return self.time_ns + span
+        now = self.time_ns
+        self._catch_up()
+        return now, now + span
 
-    def _await(self, wanted: Wanted, limit_ns: int) -> Transmission | None:
-        """Run until the first such frame that ends by the limit."""
-        search = Search(wanted, self.rows, limit_ns)
+    def _since(self, now: int) -> int:
+        """From when on a frame may be the answer to what the test did last: `now` where time is virtual."""
+        return now
+
+    def _await(self, wanted: Wanted, from_ns: int, limit_ns: int) -> tuple[Transmission | None, int]:
+        """Run until the first such frame that ends in that time; also how many frames were not heard meanwhile."""
+        missed = self.missed
+        search = Search(wanted, self.rows, from_ns, limit_ns)
         self._advance(limit_ns, search.is_over, every_frame=True)
-        return search.found
+        return search.found, self.missed - missed
 
     def _words(self, wanted: Wanted) -> str:
         name = frame_name(self.plan, wanted.cob_id)

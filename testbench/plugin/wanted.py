@@ -46,14 +46,22 @@ class Wanted:
 
 @final
 class Search:
-    """Looks for the first wanted frame among the rows that come, those that end by `limit_ns`."""
+    """Looks for the first wanted frame among the rows that come, those that end after `from_ns`, by `limit_ns`.
 
-    def __init__(self, wanted: Wanted, rows: list[Transmission], limit_ns: int) -> None:
+    A row may come long after its frame has ended: only the times say whether it counts. So the newest of `rows` are
+    looked at too, back to the first that is too early.
+    """
+
+    def __init__(self, wanted: Wanted, rows: list[Transmission], from_ns: int, limit_ns: int) -> None:
         self.found: Transmission | None = None
         self._wanted: Final[Wanted] = wanted
         self._rows: Final[list[Transmission]] = rows
+        self._from_ns: Final[int] = from_ns
         self._limit_ns: Final[int] = limit_ns
-        self._at: int = len(rows)
+        at = len(rows)
+        while at and rows[at - 1].end_ns > from_ns:
+            at -= 1
+        self._at: int = at
 
     def is_over(self) -> bool:
         """Look at the new rows; True once one is found."""
@@ -61,7 +69,7 @@ class Search:
         while self.found is None and self._at < len(rows):
             row = rows[self._at]
             self._at += 1
-            if row.end_ns <= self._limit_ns and self._wanted.fits(row):
+            if self._from_ns < row.end_ns <= self._limit_ns and self._wanted.fits(row):
                 self.found = row
         return self.found is not None
 

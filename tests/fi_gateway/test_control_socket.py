@@ -1,5 +1,6 @@
 """Live control over a local socket: a server that is driven by hand, real sockets, no sleeping."""
 
+import itertools
 import json
 import select
 import socket
@@ -12,10 +13,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from canopen_exo.bus.lateness import Lateness
-from canopen_exo.bus.node import MS, NEVER
+from canopen_exo.bus.node import MS, NEVER, SECOND
 from canopen_exo.bus.realtime import RealTimeLoop
 from fi_gateway.control import LiveControl
-from fi_gateway.control_socket import MAX_CLIENTS, MAX_LINE, ControlServer, answer_request, ask, ask_listing
+from fi_gateway.control_socket import IDLE_NS, MAX_CLIENTS, MAX_LINE, ControlServer, answer_request, ask, ask_listing
 from fi_gateway.effects import ConstantTime
 from fi_gateway.errors import FaultError
 from fi_gateway.events import At
@@ -43,7 +44,7 @@ class Readers:
     def turn(self, timeout_s: float = PATIENCE_S) -> bool:
         """Serve what is readable; False when nothing was."""
         readable, _, _ = select.select(list(self.callbacks), [], [], timeout_s)
-        self.now += 1
+        self.now += bool(readable)
         for fd in readable:
             if fd in self.callbacks:
                 self.callbacks[fd][1](self.now)
@@ -88,6 +89,8 @@ class Bench:
         """The answers to what is sent."""
         link.sendall(data)
         self.readers.turn()
+        while self.readers.turn(0.0):
+            pass
         return self.read(link)
 
     def read(self, link: socket.socket) -> list[dict[str, object]]:
@@ -242,11 +245,45 @@ def test_a_client_that_leaves_in_mid_line_leaves_nothing(bench: Bench) -> None:
     assert bench.live.rows == []
 
 
-def test_the_number_of_clients_is_bounded(bench: Bench) -> None:
-    """One too many is let go at once; the others stay."""
-    links = [bench.connect() for _ in range(MAX_CLIENTS + 1)]
-    assert is_closed(links[-1])
-    assert bench.say(links[0], b'{"do": "stop"}\n')[0]["ok"]
+def test_the_number_of_clients_is_bounded_and_the_longest_idle_makes_room(bench: Bench) -> None:
+    """Connections that ask nothing, or never finish a request, keep nobody from `stop`."""
+    links = [bench.connect() for _ in range(MAX_CLIENTS)]
+    assert bench.say(links[0], b'{"do": "list"}\n')[0]["ok"]
+    links[1].sendall(b'{"do": ')
+    bench.readers.turn()
+    newest = bench.connect()
+    assert is_closed(links[1])
+    assert len(bench.readers.callbacks) == 1 + MAX_CLIENTS
+    assert bench.say(newest, b'{"do": "stop"}\n')[0]["ok"]
+    assert bench.say(links[0], b'{"do": "resume"}\n')[0]["ok"]
+
+
+def test_a_client_that_asks_nothing_for_long_is_let_go(bench: Bench) -> None:
+    """Counted from its last request; what comes and goes in pieces is none."""
+    silent, asking = bench.connect(), bench.connect()
+    bench.readers.now = IDLE_NS // 2
+    silent.sendall(b"{")
+    assert bench.say(asking, b'{"do": "list"}\n')[0]["ok"]
+    bench.server.tidy(IDLE_NS)
+    assert len(bench.readers.callbacks) == 3
+    bench.server.tidy(IDLE_NS + SECOND)
+    assert is_closed(silent)
+    assert bench.say(asking, b'{"do": "stop"}\n')[0]["ok"]
+
+
+def test_requests_sent_at_once_are_done_one_a_turn(bench: Bench) -> None:
+    """Between two of them the gateway looks at its buses: nobody stops the frames by asking much."""
+    first, second = bench.connect(), bench.connect()
+    words = ["start", *["stop", "resume"] * 100]
+    first.sendall(b"".join(b'{"do":"%s"}\n' % word.encode() for word in words))
+    second.sendall(b'{"do":"list"}\n' * 3)
+    turns = [len(bench.live.rows)]
+    while len(bench.live.rows) < len(words):
+        assert bench.readers.turn()
+        turns.append(len(bench.live.rows))
+    assert max(after - before for before, after in itertools.pairwise(turns)) == 1
+    assert [row.what for row in bench.live.rows] == words
+    assert all(answer["ok"] for answer in (*bench.read(first), *bench.read(second)))
 
 
 def test_a_client_that_never_reads_is_let_go_and_never_waited_for(bench: Bench) -> None:

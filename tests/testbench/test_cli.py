@@ -501,3 +501,9 @@ def test_reader_that_has_left_changes_nothing(place: Path) -> None:
     assert process.stderr.read() == ""
     process.stderr.close()
     assert process.wait(timeout=60) == 0
+
+
+def test_a_bit_rate_of_a_hub_without_bit_time_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    """docs/hub.md: not silently ignored."""
+    assert main(["hub", "--listen", "127.0.0.1:0", "--bitrate", "500000"]) == 2
+    assert "add --timed" in capsys.readouterr().err

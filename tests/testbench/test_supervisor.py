@@ -8,6 +8,7 @@ import os
 import re
 import select
 import signal
+import socket
 import struct
 import subprocess
 import sys
@@ -20,7 +21,7 @@ from canopen_exo.bus.node import SECOND
 from canopen_exo.cia402 import DriveState
 from testbench import supervisor
 from testbench.child import ProcessError
-from testbench.cli import INVALID
+from testbench.cli import INVALID, USAGE, main
 from testbench.errors import BenchError
 from testbench.process import LEAVE_NS
 from testbench.scenario import JOINT_NAMES, Scenario
@@ -175,16 +176,44 @@ def test_part_that_is_never_heard_is_named(scenario: Scenario, monkeypatch: pyte
 
 
 def test_hub_that_cannot_listen_is_told_with_its_last_words(scenario: Scenario) -> None:
-    """Which one, why, its last lines."""
+    """Which one, why, its last lines; no process has failed, the place given is taken."""
     with nothing_left(Supervisor(Setup(scenario))) as rig:
         rig.start([])
         address = rig.buses[0].removeprefix("hub:").partition("/")[0]
         with Supervisor(Setup(scenario, listen=address)) as second:
-            with pytest.raises(ProcessError) as raised:
+            with pytest.raises(BenchError) as raised:
                 second.start()
+            assert not isinstance(raised.value, ProcessError)
             assert list(second.processes) == ["hub"]
     assert "hub ended with exit code 2; its last lines:" in str(raised.value)
     assert "stop what runs there" in str(raised.value)
+
+
+def test_up_refuses_an_address_in_use_like_any_wrong_argument(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Exit code 2, and the reason once."""
+    (tmp_path / "rig.yaml").write_text(TEXT)
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        address = f"127.0.0.1:{taken.getsockname()[1]}"
+        assert main(["up", str(tmp_path / "rig.yaml"), "--listen", address]) == USAGE
+    assert capfd.readouterr().err.count("stop what runs there") == 1
+
+
+@linux
+def test_control_socket_of_a_killed_gateway_is_removed(scenario: Scenario, tmp_path: Path) -> None:
+    """At a path that was given too; nothing of a rig is left."""
+    path = tmp_path / "control"
+    with nothing_left(Supervisor(Setup(scenario, control=str(path)))) as rig:
+        rig.start(["joints", "gateway"])
+        gateway = rig.processes["gateway"]
+        limit = rig.now() + LONG_NS
+        while not path.exists() and rig.now() < limit:
+            rig.poll()
+        gateway.tell(signal.SIGKILL)
+        gateway.wait(LONG_NS / SECOND)
+        assert path.exists()
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_bus_that_is_not_there_is_told_before_anything_starts(scenario: Scenario) -> None:

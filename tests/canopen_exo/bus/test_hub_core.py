@@ -479,3 +479,27 @@ def test_rogue_that_neither_reads_nor_stops_cannot_fill_the_memory(kind: int) ->
     rogue.outbox.clear()
     hub.drained(rogue)
     assert (rogue.overflow, len(rogue.outbox) <= 24) == (0, True)
+
+
+def test_rogue_that_never_reads_what_it_has_sent_cannot_fill_the_memory() -> None:
+    """Confirmations are put off while the outbox is full, and none of the frames they count is forgotten."""
+    hub = Hub(MBIT)
+    rogue = join(hub, options=OPTION_CONFIRM)
+    filler = OUTBOX_LIMIT // 24 - 10
+    assert rogue.offer(pack_frame(Frame(2, b""), 0) * filler, filler) == 0
+    now = sent = 0
+    for _ in range(100):
+        hub.received(rogue, pack_frame(Frame(1, b"")) * (2 * CONFIRM_EVERY), now)
+        hub.settle(now)
+        sent += 2 * CONFIRM_EVERY
+        while hub.wake_at != NEVER:
+            now = hub.wake_at
+            hub.wake(now)
+            hub.settle(now)
+    assert len(rogue.outbox) <= OUTBOX_LIMIT + 24
+    told = records(rogue)[filler:]
+    hub.drained(rogue)
+    assert len(rogue.outbox) == 24
+    told += records(rogue)
+    assert {record[0] for record in told} == {KIND_SENT}
+    assert sum(unpack_record(record, 0)[0] for record in told) == sent

@@ -67,17 +67,19 @@ def test_an_id_that_cannot_be_is_refused(cob_id: int) -> None:
 def test_a_search_finds_the_first_new_frame_by_the_limit() -> None:
     """Frames before the call, and those that end after the limit, are not meant; the limit itself is."""
     frame = Frame(0x085, b"")
-    rows = [row(frame, end_ns=1)]
-    search = Search(Wanted(0x085, None, 1), rows, 10)
+    rows = [row(frame, end_ns=5)]
+    search = Search(Wanted(0x085, None, 1), rows, 5, 10)
+    assert not search.is_over()
+    rows.append(row(frame, end_ns=4))
     assert not search.is_over()
     rows += [row(Frame(0x086, b""), end_ns=5), row(frame, end_ns=10), row(frame, end_ns=10)]
     assert search.is_over()
-    assert search.found is rows[2]
+    assert search.found is rows[3]
 
 
 def test_a_frame_after_the_limit_is_too_late() -> None:
     """`within` includes its end and nothing behind it."""
     rows: list[Transmission] = []
-    search = Search(Wanted(0x085, None, 1), rows, 10)
+    search = Search(Wanted(0x085, None, 1), rows, 0, 10)
     rows.append(row(Frame(0x085, b""), end_ns=11))
     assert not search.is_over()
