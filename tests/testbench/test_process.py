@@ -16,6 +16,7 @@ import pytest
 
 from canopen_exo.bus.channel import Arrival, Channel
 from canopen_exo.bus.frame import Frame
+from canopen_exo.bus.interfaces import BusName, parse_bus
 from canopen_exo.bus.node import MS, NEVER, Node
 from fi_gateway.control import NAMED, WORDS
 from fi_gateway.control_socket import DEFAULT_ADDRESS
@@ -67,8 +68,8 @@ def channels(monkeypatch: pytest.MonkeyPatch) -> list[DeadChannel]:
     """Every interface that is opened is one of these."""
     opened: list[DeadChannel] = []
 
-    def open_dead(name: str) -> Channel:
-        opened.append(DeadChannel(name))
+    def open_dead(bus: BusName) -> Channel:
+        opened.append(DeadChannel(str(bus)))
         return opened[-1]
 
     monkeypatch.setattr(process, "open_bus", open_dead)
@@ -99,7 +100,7 @@ def test_joints_told_to_end_leave_their_part(
     """SIGTERM ends a process in order, part and all, and its interface is closed."""
     next(signalled).append(signal.SIGTERM)
     part = tmp_path / "joints.npz"
-    assert joints_main(scenario, "hub:drive", ProcessOptions(part=part)) == 0
+    assert joints_main(scenario, parse_bus("hub:drive"), ProcessOptions(part=part)) == 0
     assert read_joints(part).q.shape[1] == 6
     assert [(channel.name, channel.closed) for channel in channels] == [("hub:drive", True)]
 
@@ -110,7 +111,7 @@ def test_controller_told_to_end_before_it_began_leaves_at_once(
     """Asked for, so no failure: exit 0."""
     next(signalled).append(signal.SIGTERM)
     part = tmp_path / "hlc.npz"
-    assert hlc_main(scenario, "hub:controller", ProcessOptions(part=part), endless=True) == 0
+    assert hlc_main(scenario, parse_bus("hub:controller"), ProcessOptions(part=part), endless=True) == 0
     assert not read_hlc(part).completed
 
 
@@ -119,7 +120,7 @@ def test_controller_without_drives_gives_up_and_says_why(
 ) -> None:
     """Exit 1: no boot-up message within 1 s; nothing hangs."""
     part = tmp_path / "hlc.npz"
-    assert hlc_main(scenario, "hub:controller", ProcessOptions(part=part), endless=False) == 1
+    assert hlc_main(scenario, parse_bus("hub:controller"), ProcessOptions(part=part), endless=False) == 1
     (event,) = read_hlc(part).events
     assert "no boot-up message" in event.text
     assert event.text in capfd.readouterr().err
@@ -132,7 +133,7 @@ def test_frame_that_is_there_before_the_controller_begins_does_not_keep_it_from_
     """A bus is never silent when a process joins it: here the late answer to somebody's SDO request."""
     answer = Arrival(0, Frame(0x581, bytes.fromhex("4300100092010200")), None)
     monkeypatch.setattr(DeadChannel, "there_already", [answer])
-    assert hlc_main(scenario, "hub:controller", ProcessOptions(), endless=False) == 1
+    assert hlc_main(scenario, parse_bus("hub:controller"), ProcessOptions(), endless=False) == 1
     assert Frame(0x77F, b"\x00") in channels[0].sent  # and gave up for want of drives
 
 
@@ -143,7 +144,8 @@ def test_gateway_first_stops_injecting_and_ends_with_the_second_interrupt(
     next(signalled).extend([signal.SIGINT, signal.SIGINT])
     part = tmp_path / "gateway.npz"
     options = ProcessOptions(part=part)
-    assert gateway_main(faults_of(scenario), ("hub:controller", "hub:drive"), options, GatewayOptions()) == 0
+    buses = (parse_bus("virtual:controller"), parse_bus("virtual:drive"))
+    assert gateway_main(faults_of(scenario), buses, options, GatewayOptions()) == 0
     (row,) = read_gateway(part).controls
     assert (row.what, row.name, row.source, row.refused) == ("stop", "", "signal", "")
     assert [channel.name for channel in channels] == ["hub:controller", "hub:drive"]
@@ -209,7 +211,7 @@ def test_folder_of_the_rig_goes_when_the_supervisor_is_gone_and_not_when_it_tell
     folder.mkdir()
     (folder / "scenario.yaml").touch()
     options = ProcessOptions(supervisor=os.getppid(), folder=folder)  # which is there, as far as anyone can see
-    with session("joints", Node(), ["hub:drive"], [0], options) as served:
+    with session("joints", Node(), [parse_bus("hub:drive")], [0], options) as served:
         signal.raise_signal(number)
         served.run(lambda now: served.orders.count > 0)
     assert folder.exists() == stays
@@ -227,13 +229,13 @@ def test_process_ends_when_its_supervisor_is_gone(
 ) -> None:
     """Where the kernel does not tell, the process looks by itself."""
     monkeypatch.setattr(process, "die_with", lambda supervisor: None)
-    with session("joints", Node(), ["hub:drive"], [0], ProcessOptions(supervisor=2**22 + 1)) as served:
+    with session("joints", Node(), [parse_bus("hub:drive")], [0], ProcessOptions(supervisor=2**22 + 1)) as served:
         served.run(lambda now: False)
 
 
 def test_nodes_begin_on_the_next_whole_millisecond(channels: list[DeadChannel]) -> None:
     """All processes share one epoch, so that the grids of physics and SYNC agree."""
-    with session("joints", Node(), ["hub:drive"], [0], ProcessOptions(epoch_ns=1)) as served:
+    with session("joints", Node(), [parse_bus("hub:drive")], [0], ProcessOptions(epoch_ns=1)) as served:
         assert served.start_ns % MS == 0
         assert 0 < served.start_ns - served.loop.now() + MS <= 2 * MS or served.start_ns <= served.loop.now()
         assert served.loop.epoch_ns == 1
