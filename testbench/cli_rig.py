@@ -148,8 +148,10 @@ def check_two(controller: "BusName", drive: "BusName") -> None:
     from canopen_exo.bus.interfaces import same_bus
 
     if same_bus(controller, drive):
-        both = str(controller) if controller == drive else f"{controller} and {drive}, which is"
-        raise BenchError(f"controller bus and drive bus are the same, {both}: frames would go round for ever")
+        raise BenchError(
+            f"controller bus {controller} and drive bus {drive} are one bus: frames would go round for ever; name "
+            "two buses"
+        )
 
 
 def _add_scenario(parser: argparse.ArgumentParser) -> None:
