@@ -24,6 +24,7 @@ Usage: python -m benchmarks.bench_gateway [--rounds N] [--frames N] [--rate N] [
 """
 
 import argparse
+import errno
 import json
 import math
 import os
@@ -42,7 +43,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import FrameType
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from canopen_exo.bus.node import SECOND
 from canopen_exo.bus.realtime import RealTimeLoop
@@ -55,6 +56,9 @@ from fi_gateway.faults import Bias
 from fi_gateway.gateway import Gateway
 from fi_gateway.injector import Injector, Target, stream
 from testbench.scenario import default_joints
+
+if TYPE_CHECKING:
+    from _typeshed import ReadableBuffer
 
 ROOT: Final = Path(__file__).resolve().parent.parent
 
@@ -81,6 +85,8 @@ VCAN_LIMIT_S: Final = 300.0
 PROBE: Final = struct.pack("=IBBBB8s", 0x7E5, 1, 0, 0, 0, b"?")
 
 GATEWAY: Final = "gateway"
+BUSY_GATEWAY: Final = "gateway-on-busy-buses"
+"""For the soak: its sockets refuse again and again, as those of busy interfaces do."""
 BRIDGE: Final = "can_bridge"
 BARE: Final = "bare loop"
 CANGW: Final = "cangw"
@@ -117,8 +123,40 @@ def rule() -> Injector:
     return Injector("bias", target, Bias(signal_, 100), At((0,)), Infinite(), None, stream(1, 0, "bias"), True, True)
 
 
+class BusySocket(socket.socket):
+    """Refuses one to seven sends in a row out of every 50, as a full interface queue (ENOBUFS) or socket (EAGAIN)."""
+
+    def __init__(self, fileno: int) -> None:
+        super().__init__(fileno=fileno)
+        self.sends = 0
+        self.refusals = 0
+
+    def send(self, data: "ReadableBuffer", flags: int = 0, /) -> int:
+        """Hand over, or refuse."""
+        self.sends += 1
+        rounds, place = divmod(self.sends, 50)
+        if place <= rounds % 7:
+            self.refusals += 1
+            if rounds % 2:
+                raise OSError(errno.ENOBUFS, "No buffer space available")
+            raise BlockingIOError(errno.EAGAIN, "Resource temporarily unavailable")
+        return super().send(data, flags)
+
+
+def serve_busy_gateway(ends: list[str]) -> None:
+    """Our gateway with sockets that refuse."""
+    busy = [BusySocket(int(end)) for end in ends]
+    account = served([lambda: busy[0], lambda: busy[1]])
+    print(json.dumps({**account, "refusals": busy[0].refusals + busy[1].refusals}))
+
+
 def serve_gateway(ends: list[str]) -> None:
-    """Our gateway until SIGTERM; then its own account of it, as JSON."""
+    """Our gateway."""
+    print(json.dumps(served([lambda: near_socket(ends[0]), lambda: near_socket(ends[1])])))
+
+
+def served(openers: list[Callable[[], socket.socket]]) -> dict[str, object]:
+    """Our gateway until SIGTERM; then its own account of it."""
     stopped = False
 
     def stop(number: int, frame: FrameType | None) -> None:
@@ -126,8 +164,7 @@ def serve_gateway(ends: list[str]) -> None:
         stopped = True
 
     signal.signal(signal.SIGTERM, stop)
-    # mypy cannot infer a lambda whose default argument binds the loop variable
-    channels = [SocketCanChannel(f"socketcan:{end}", lambda end=end: near_socket(end)) for end in ends]  # type: ignore[misc]
+    channels = [SocketCanChannel(f"socketcan:{place}", opener) for place, opener in enumerate(openers)]
     epoch_ns = time.monotonic_ns()
     for channel in channels:
         channel.epoch_ns = epoch_ns
@@ -137,13 +174,12 @@ def serve_gateway(ends: list[str]) -> None:
     loop.run(lambda now: stopped)
     latency = loop.latency[0]
     latency.merge(loop.latency[1])
-    account = {
+    return {
         "losses": loop.losses(),
         "frames": gateway.frames,
         "changed": gateway.injectors[0].manifested,
         "latency": latency.document(),
     }
-    print(json.dumps(account))
 
 
 def serve_bridge(ends: list[str]) -> None:
@@ -188,7 +224,7 @@ def serve_bare(ends: list[str]) -> None:
                 pass
 
 
-SERVE: Final = {GATEWAY: serve_gateway, BRIDGE: serve_bridge, BARE: serve_bare}
+SERVE: Final = {GATEWAY: serve_gateway, BUSY_GATEWAY: serve_busy_gateway, BRIDGE: serve_bridge, BARE: serve_bare}
 
 
 # --- what is connected to both buses -------------------------------------------------------------------------------

@@ -88,6 +88,7 @@ INTERPRETED: Final = {
     "canopen_exo/bus/hub*.py": "a process of its own, in real time only",
     "canopen_exo/bus/interfaces.py": "runs once, opens interfaces",
     "canopen_exo/bus/lateness.py": "real time only",
+    "canopen_exo/bus/losses.py": "real time only: told at the end",
     "canopen_exo/bus/realtime*.py": "real time only: waits for the kernel",
     "canopen_exo/bus/recvmmsg.py": "real time only: one system call, through ctypes",
     "canopen_exo/bus/scheduling.py": "runs once",

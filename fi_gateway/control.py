@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, final
 
 from canopen_exo.bus.lateness import Lateness
+from canopen_exo.bus.losses import Losses
 from canopen_exo.bus.node import NEVER
 from fi_gateway.errors import FaultError
 from fi_gateway.gateway import CONTROLLER_PORT, DRIVE_PORT, Gateway
@@ -29,6 +30,10 @@ ADD: Final = "add"
 WORDS: Final = (ARM, DISARM, TRIGGER, START, STOP, RESUME)
 NAMED: Final = (ARM, DISARM, TRIGGER)
 """The words that are about one injector; the others are about the gateway."""
+
+CHANGES_SHOWN: Final = 16
+"""Of each port, the latest; the cause is cut to the length after it."""
+_CAUSE_SHOWN: Final = 160
 
 DISARMED: Final = "disarmed"
 HELD: Final = "held"
@@ -226,12 +231,22 @@ def perform(control: LiveControl, word: str, name: str, now: int, source: str) -
 
 
 @dataclass(frozen=True, slots=True)
+class StateChange:
+    """An interface's new error state. time_ns: loop clock; state: an ErrorState's word; cause: from its driver."""
+
+    time_ns: int
+    state: str
+    cause: str
+
+
+@dataclass(frozen=True, slots=True)
 class Direction:
     """What went one way through a gateway, in frames.
 
     lost, inserted: by a fault; undelivered: not offered, because the interface they were for was away; notices: error
     notices of the interface they came in on; latency: from the stamp of a frame to its sending [ns], None when not
-    measured.
+    measured. overruns, malformed: at the interface they came in on; queue_full, discarded, not_taken: at the one they
+    were for, see Losses. changes: of the state of the interface they came in on, the latest CHANGES_SHOWN.
     """
 
     direction: str
@@ -241,10 +256,19 @@ class Direction:
     undelivered: int
     notices: int
     latency: Lateness | None
+    queue_full: int = 0
+    discarded: int = 0
+    not_taken: int = 0
+    overruns: int = 0
+    malformed: int = 0
+    changes: tuple[StateChange, ...] = ()
 
 
-def statistics(gateway: Gateway, latency: list[Lateness] | None) -> list[Direction]:
-    """To the drives, then to the controller. latency: by port sent on, as the real-time loop measures it."""
+def statistics(
+    gateway: Gateway, latency: list[Lateness] | None, losses: list[Losses] | None = None
+) -> list[Direction]:
+    """To the drives, then to the controller. latency, losses: by port, as the real-time loop measures them."""
+    lost = losses or [Losses(), Losses()]
     return [
         Direction(
             name,
@@ -254,9 +278,21 @@ def statistics(gateway: Gateway, latency: list[Lateness] | None) -> list[Directi
             gateway.undelivered[port],
             gateway.notices[port],
             None if latency is None else latency[1 - port],
+            lost[1 - port].queue_full,
+            lost[1 - port].discarded,
+            lost[1 - port].not_taken,
+            lost[port].overruns,
+            lost[port].malformed,
+            _changes(gateway, port),
         )
         for port, name in ((CONTROLLER_PORT, "to_drives"), (DRIVE_PORT, "to_controller"))
     ]
+
+
+def _changes(gateway: Gateway, port: int) -> tuple[StateChange, ...]:
+    """The latest of one port."""
+    found = [one for one in gateway.port_changes if one.port == port][-CHANGES_SHOWN:]
+    return tuple(StateChange(one.time_ns, one.state.value, one.cause[:_CAUSE_SHOWN]) for one in found)
 
 
 def statistics_text(directions: list[Direction]) -> str:
@@ -268,6 +304,15 @@ def statistics_text(directions: list[Direction]) -> str:
             parts.append(f"{one.inserted} added")
         if one.undelivered:
             parts.append(f"{one.undelivered} not delivered")
+        for count, what in (
+            (one.overruns, "lost before they were read"),
+            (one.malformed, "unreadable"),
+            (one.queue_full, "lost in a full queue"),
+            (one.discarded, "discarded in an outage"),
+            (one.not_taken, "not taken by the interface"),
+        ):
+            if count:
+                parts.append(f"{count} {what}")
         if one.notices:
             parts.append(f"{one.notices} error notices")
         late = one.latency
@@ -276,6 +321,16 @@ def statistics_text(directions: list[Direction]) -> str:
             parts.append(f"added latency: median {median:.0f} us, 99 % {most:.0f} us, worst {worst:.0f} us")
         lines.append(", ".join(parts))
     return "\n".join(lines)
+
+
+def changes_text(directions: list[Direction]) -> str:
+    """One line for each change of an interface's state, for people, oldest first; times on the gateway's clock."""
+    sides = {"to_drives": "controller side", "to_controller": "drive side"}
+    found = [(change.time_ns, sides[one.direction], change) for one in directions for change in one.changes]
+    return "\n".join(
+        f"{side}: {change.state.replace('_', ' ')} at {time_ns / 1e9:.3f} s: {change.cause}"
+        for time_ns, side, change in sorted(found, key=lambda row: row[0])
+    )
 
 
 def latency_text(directions: list[Direction]) -> str:

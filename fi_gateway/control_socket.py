@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Final, Protocol, final
 
 from canopen_exo.bus.lateness import Lateness
+from canopen_exo.bus.losses import Losses
 from canopen_exo.bus.node import NEVER, SECOND
 from canopen_exo.errors import CanopenExoError
 from fi_gateway.control import (
@@ -33,6 +34,8 @@ from fi_gateway.control import (
     Direction,
     InjectorRow,
     LiveControl,
+    StateChange,
+    changes_text,
     listing_text,
     perform,
     statistics,
@@ -81,15 +84,20 @@ class _Client:
 class ControlServer:
     """Serves live control at an address; `listen` binds, `attach` gives it to a loop, `close` leaves nothing behind.
 
-    latency: asked for the distributions of added latency, by port sent on.
+    latency, losses: asked for the distributions of added latency, by port sent on, and for what was lost, by port.
     """
 
     def __init__(
-        self, control: LiveControl, address: str, latency: Callable[[], list[Lateness]] | None = None
+        self,
+        control: LiveControl,
+        address: str,
+        latency: Callable[[], list[Lateness]] | None = None,
+        losses: Callable[[], list[Losses]] | None = None,
     ) -> None:
         self._control: Final[LiveControl] = control
         self._address: Final[str] = address
         self._latency: Final = latency
+        self._losses: Final = losses
         self._listener: socket.socket | None = None
         self._path: Path | None = None
         self._readers: Readers | None = None
@@ -210,7 +218,7 @@ class ControlServer:
             client.asked_ns = now
             if request is None:
                 self._dismiss(client, "not a line with one JSON object; closing")
-            elif not self._send(client, answer_request(self._control, request, now, self._latency)):
+            elif not self._send(client, answer_request(self._control, request, now, self._latency, self._losses)):
                 self._drop(client)
 
     def _dismiss(self, client: _Client, why: str) -> None:
@@ -234,6 +242,7 @@ def answer_request(
     request: dict[str, object],
     now: int,
     latency: Callable[[], list[Lateness]] | None = None,
+    losses: Callable[[], list[Losses]] | None = None,
     source: str = "socket",
 ) -> Answer:
     """Do what a request says; now: loop clock [ns]. Whatever the request, this does not raise."""
@@ -255,7 +264,7 @@ def answer_request(
     assert isinstance(word, str)
     assert isinstance(name, str)
     if word == LIST:
-        return _listing(control, now, latency)
+        return _listing(control, now, latency, losses)
     try:
         if word == ADD:
             control.add(name, request.get("injector"), now, source, request.get("at_once") is True)
@@ -316,7 +325,11 @@ class Listing:
         if self.time_zero_ns < NEVER:
             zero = f"{(self.time_ns - self.time_zero_ns) / 1e9:.3f} s after time 0"
         lines = [zero + (", injection is stopped" if self.stopped else "")]
-        return "\n".join((*lines, listing_text(self.injectors, self.time_ns), statistics_text(self.directions)))
+        lines += [listing_text(self.injectors, self.time_ns), statistics_text(self.directions)]
+        changes = changes_text(self.directions)
+        if changes:
+            lines += [changes, f"now: {self.time_ns / 1e9:.3f} s on the gateway's clock"]
+        return "\n".join(lines)
 
 
 def ask_listing(address: str, timeout_s: float = 2.0) -> Listing:
@@ -324,10 +337,16 @@ def ask_listing(address: str, timeout_s: float = 2.0) -> Listing:
     return _read_listing(json.dumps(ask(address, LIST, timeout_s=timeout_s)))
 
 
-def _listing(control: LiveControl, now: int, latency: Callable[[], list[Lateness]] | None) -> Answer:
+def _listing(
+    control: LiveControl,
+    now: int,
+    latency: Callable[[], list[Lateness]] | None,
+    losses: Callable[[], list[Losses]] | None,
+) -> Answer:
     gateway = control.gateway
     directions = []
-    for one in statistics(gateway, None if latency is None else latency()):
+    found = statistics(gateway, None if latency is None else latency(), None if losses is None else losses())
+    for one in found:
         added = None if one.latency is None else one.latency.document()
         directions.append({**asdict(replace(one, latency=None)), "latency": added})
     return {
@@ -355,7 +374,9 @@ def _read_listing(text: str) -> Listing:
         directions = []
         for one in answer["directions"]:
             added = one.pop("latency")
-            directions.append(Direction(**one, latency=None if added is None else Lateness.from_document(added)))
+            changes = tuple(StateChange(**change) for change in one.pop("changes"))
+            late = None if added is None else Lateness.from_document(added)
+            directions.append(Direction(**one, latency=late, changes=changes))
         injectors = [InjectorRow(**{**row, "next_ns": _or_never(row["next_ns"])}) for row in answer["injectors"]]
         zero = _or_never(answer["time_zero_ns"])
         return Listing(answer["time_ns"], zero, answer["stopped"], injectors, directions)

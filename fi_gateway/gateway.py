@@ -63,7 +63,7 @@ _PROBE_NS: Final = 20 * MS
 """While a port is away: the distance of frames that are offered to it all the same."""
 
 _CHANGES_KEPT: Final = 4096
-"""A bus that flaps for days must not fill the memory; `notices` goes on counting."""
+"""A bus that flaps for days must not fill the memory: the latest; `notices` goes on counting."""
 
 
 @final
@@ -358,8 +358,9 @@ class Gateway(Relay):
     def _change(self, now: int, port: int, state: ErrorState, cause: str) -> None:
         """A port has a new state."""
         self._states[port] = state
-        if len(self.port_changes) < _CHANGES_KEPT:
-            self.port_changes.append(PortChange(now, port, state, cause))
+        if len(self.port_changes) >= _CHANGES_KEPT:
+            del self.port_changes[0]
+        self.port_changes.append(PortChange(now, port, state, cause))
         self._away[port] = state is ErrorState.BUS_OFF or state is ErrorState.DOWN
         self._probe_at[port] = now + _PROBE_NS
         self.is_disturbed = self._away[0] or self._away[1]

@@ -13,6 +13,7 @@ from testbench.errors import BenchError
 
 if TYPE_CHECKING:
     from canopen_exo.bus.hub_core import MakeBus
+    from canopen_exo.bus.interfaces import BusName
     from testbench.fault_file import FaultFile
     from testbench.process import ProcessOptions
     from testbench.scenario import Scenario
@@ -137,13 +138,25 @@ def named_buses(options: argparse.Namespace) -> tuple[str, str] | None:
     if controller is None or drive is None:
         given, missing = ("--controller-bus", "--drive-bus") if drive is None else ("--drive-bus", "--controller-bus")
         raise BenchError(f"{given} is given without {missing}: the gateway stands between two buses; give both or none")
-    _check_two(controller, drive)
+    from canopen_exo.bus.interfaces import parse_bus
+    from canopen_exo.errors import CanopenExoError
+
+    try:
+        check_two(parse_bus(controller), parse_bus(drive))
+    except CanopenExoError as error:
+        raise BenchError(str(error)) from error
     return controller, drive
 
 
-def _check_two(controller: str, drive: str) -> None:
-    if controller == drive:
-        raise BenchError(f"--controller-bus and --drive-bus are both {controller}: frames would go round for ever")
+def check_two(controller: "BusName", drive: "BusName") -> None:
+    """Refuse one bus under two names; raises BenchError."""
+    from canopen_exo.bus.interfaces import same_bus
+
+    if same_bus(controller, drive):
+        raise BenchError(
+            f"controller bus {controller} and drive bus {drive} are one bus: frames would go round for ever; name "
+            "two buses"
+        )
 
 
 def _add_scenario(parser: argparse.ArgumentParser) -> None:
@@ -203,7 +216,7 @@ def _gateway(options: argparse.Namespace) -> int:
         if faults is None:
             return USAGE
         buses = (_bus(options.controller_bus, "controller"), _bus(options.drive_bus, "drive"))
-        _check_two(*buses)
+        check_two(*buses)
         frames = None if options.control_frames is None else control_frames(options.control_frames)
         return gateway_main(faults, buses, how, GatewayOptions(not options.no_faults, options.control, frames))
 
@@ -259,14 +272,14 @@ def read_scenario(options: argparse.Namespace) -> "Scenario | None":
         return None
 
 
-def _bus(given: str | None, role: str) -> str:
-    """The bus given; else that of python-can's configuration; else the one on the default hub."""
-    if given is not None:
-        return given
-    from canopen_exo.bus.interfaces import configured_bus
+def _bus(given: str | None, role: str) -> "BusName":
+    """The bus given; else that of python-can's configuration, with its section; else the one on the default hub."""
+    from canopen_exo.bus.interfaces import configured_bus, parse_bus
 
+    if given is not None:
+        return parse_bus(given)
     configured = configured_bus(role)
-    return str(configured) if configured is not None else f"hub:{role}"
+    return configured if configured is not None else parse_bus(f"hub:{role}")
 
 
 def _hub(options: argparse.Namespace) -> int:

@@ -1,18 +1,24 @@
 """The gateway as a process: two interfaces, live control over a socket and, where asked for, over the bus.
 
 The first SIGINT stops injecting and frames pass on until `exo-hil fault resume`; the second one, or SIGTERM, ends it.
-It says what it stands between when it is ready, and what went through it, by direction, at its end.
+It says what it stands between when it is ready, what is lost when that first happens, and what went through it, by
+direction, at its end.
+On Linux a second gateway between the same two buses is refused: with two, every frame would go round for ever.
 Needs neither MuJoCo nor the controller.
 """
 
+import errno
+import hashlib
 import logging
+import socket
 import sys
-from contextlib import closing, nullcontext
+from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+from canopen_exo.bus.interfaces import BusName, bus_identity
 from fi_gateway.bus_control import DEFAULT_COMMAND_ID, DEFAULT_STATUS_ID, BusControl
-from fi_gateway.control import LiveControl, latency_text, statistics, statistics_text
+from fi_gateway.control import LiveControl, changes_text, latency_text, statistics, statistics_text
 from fi_gateway.control_socket import ControlServer
 from fi_gateway.errors import FaultError
 from fi_gateway.gateway import CONTROLLER_PORT, DRIVE_PORT, Gateway
@@ -44,7 +50,7 @@ class GatewayOptions:
 
 
 def gateway_main(
-    faults: "FaultFile", buses: tuple[str, str], options: ProcessOptions, given: GatewayOptions
+    faults: "FaultFile", buses: tuple[BusName, BusName], options: ProcessOptions, given: GatewayOptions
 ) -> int:
     """The gateway between two buses, until told to end. Raises BenchError, FaultError."""
     from fi_gateway.addition import Additions
@@ -57,8 +63,8 @@ def gateway_main(
     control = LiveControl(gateway, additions)
     if given.frames is not None:
         gateway.attach(BusControl(control, given.frames.port, given.frames.command_id, given.frames.status_id))
-    with session("gateway", gateway, list(buses), [0, 1], options) as process:
-        server = ControlServer(control, given.control, lambda: process.loop.latency) if given.control else None
+    with claimed(buses), session("gateway", gateway, list(buses), [0, 1], options) as process:
+        server = _server(given.control, control, process)
         with closing(server) if server is not None else nullcontext():
             if server is not None:
                 server.listen()
@@ -71,10 +77,42 @@ def gateway_main(
         gateway.finish(process.loop.now())
         if options.part is not None:
             _leave_part(options, process, control)
-        directions = statistics(gateway, process.loop.latency)
-        for line in f"{statistics_text(directions)}\n{latency_text(directions)}".splitlines():
-            say("gateway", line)
+        directions = statistics(gateway, process.loop.latency, process.loop.losses_by_channel())
+        for text in (statistics_text(directions), changes_text(directions), latency_text(directions)):
+            for line in text.splitlines():
+                say("gateway", line)
     return DONE
+
+
+def claimed(buses: tuple[BusName, BusName]) -> AbstractContextManager[object]:
+    """No other gateway between the same two buses while this lasts, as far as this machine's network reaches.
+
+    A Unix socket in the abstract name space (unix(7), Linux) is the sign: it belongs to the network name space, as
+    interfaces and loopback ports do, and goes with its process. Raises BenchError. Left out: other systems, other
+    machines, other programs; python-can's `virtual` buses, which end at their process.
+    """
+    if sys.platform != "linux" or any(bus.interface == "virtual" for bus in buses):
+        return nullcontext()
+    pair = " ".join(sorted(bus_identity(bus) for bus in buses))
+    sign = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    try:
+        sign.bind(b"\0exo-hil gateway " + hashlib.sha256(pair.encode()).hexdigest().encode())
+    except OSError as error:
+        sign.close()
+        if error.errno != errno.EADDRINUSE:
+            raise
+        raise BenchError(
+            f"gateway: another one stands between {buses[0]} and {buses[1]} already, and with two every frame would go "
+            "round for ever; end that one, or name other buses"
+        ) from error
+    return closing(sign)
+
+
+def _server(address: str, control: LiveControl, process: Session) -> ControlServer | None:
+    """Live control over a socket, where it is asked for."""
+    if not address:
+        return None
+    return ControlServer(control, address, lambda: process.loop.latency, process.loop.losses_by_channel)
 
 
 def _injectors_text(gateway: Gateway) -> str:

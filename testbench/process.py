@@ -21,7 +21,7 @@ from types import FrameType
 from typing import TYPE_CHECKING, Final, final
 
 from canopen_exo.bus.channel import Channel
-from canopen_exo.bus.interfaces import open_channel, parse_bus
+from canopen_exo.bus.interfaces import BusName, open_channel, parse_bus
 from canopen_exo.bus.node import MS, NEVER, SECOND, Node
 from canopen_exo.bus.realtime import RealTimeLoop, request_fifo
 from canopen_exo.errors import CanopenExoError
@@ -119,39 +119,57 @@ class Session:
         self._channels: Final[list[Channel]] = channels
         self._supervisor: Final[int] = options.supervisor
         self._look_at: int = 0
+        self._told: Final[set[str]] = set()
 
     def run(self, until: Callable[[int], bool]) -> None:
-        """Serve until `until(now)`, or until the supervisor is gone."""
+        """Serve until `until(now)`, or until the supervisor is gone; say what is lost when it first happens."""
 
         def over(now: int) -> bool:
-            if self._supervisor and now >= self._look_at:
+            if now >= self._look_at:
                 self._look_at = now + _LOOK_NS
-                if os.getppid() != self._supervisor:
+                self._warn()
+                if self._supervisor and os.getppid() != self._supervisor:
                     return True
             return until(now)
 
         self.loop.run(over)
+        self._warn()
+
+    def losses(self) -> dict[str, int]:
+        """What was lost so far, in words -> frames; empty when nothing was."""
+        found: dict[str, int] = {}
+        for channel, lost in zip(self._channels, self.loop.losses_by_channel(), strict=True):
+            for count, what in (
+                (lost.queue_full, f"dropped, the transmit queue for {channel.name} was full"),
+                (lost.discarded, f"discarded, {channel.name} was off"),
+                (lost.overruns, f"dropped by {channel.name} before they were read"),
+                (lost.not_taken, f"not taken by {channel.name}"),
+            ):
+                if count:
+                    found[what] = count
+        return found
+
+    def _warn(self) -> None:
+        """The first time each kind of loss shows."""
+        found = self.losses()
+        for channel in self._channels:
+            if channel.malformed:
+                found[f"unreadable from {channel.name}"] = channel.malformed
+        for what, count in found.items():
+            if what not in self._told:
+                self._told.add(what)
+                say(self.name, f"warning: {count} frames {what}; counted from now on, told at the end")
 
     def service(self) -> "Service":
         """How it was served, for its part."""
         from testbench.parts import Service
 
-        losses = {
-            f"dropped at port {port}, its transmit queue was full": count
-            for port, count in enumerate(self.loop.dropped)
-            if count
-        }
-        for channel in self._channels:
-            if channel.overruns:
-                losses[f"dropped by {channel.name} before they were read"] = channel.overruns
-            if channel.lost:
-                losses[f"not taken by {channel.name}"] = channel.lost
-        return Service(self.start_ns, self.loop.now(), self.loop.lateness, losses)
+        return Service(self.start_ns, self.loop.now(), self.loop.lateness, self.losses())
 
 
 @contextmanager
 def session(
-    name: str, node: Node, buses: list[str], ports: list[int], options: ProcessOptions
+    name: str, node: Node, buses: list[BusName], ports: list[int], options: ProcessOptions
 ) -> Iterator[Session]:
     """A node with its interfaces open. Raises BenchError when one cannot be opened; says what it could not get."""
     orders = Orders()
@@ -173,7 +191,7 @@ def session(
         remove_orphaned(options.folder, options.supervisor, orders.is_hung_up)
 
 
-def joints_main(scenario: "Scenario", bus: str, options: ProcessOptions) -> int:
+def joints_main(scenario: "Scenario", bus: BusName, options: ProcessOptions) -> int:
     """Six drives on their plant, until told to end."""
     from testbench.rig import build_mechanics, build_rack
     from testbench.run import rig_params
@@ -195,7 +213,7 @@ def joints_main(scenario: "Scenario", bus: str, options: ProcessOptions) -> int:
     return DONE
 
 
-def hlc_main(scenario: "Scenario", bus: str, options: ProcessOptions, endless: bool) -> int:
+def hlc_main(scenario: "Scenario", bus: BusName, options: ProcessOptions, endless: bool) -> int:
     """The high-level controller: one motion, or with `endless` until told to end. 1 when it gave up."""
     from hlc.node import Phase
     from testbench.rig import build_master, build_mechanics
@@ -269,10 +287,10 @@ def _leave_hlc(path: Path, process: Session, controller: "HighLevelController") 
     write_hlc(path, part)
 
 
-def open_bus(bus: str) -> Channel:
+def open_bus(bus: BusName | str) -> Channel:
     """The interface of that name; raises BenchError with one line that says what is missing."""
     try:
-        return open_channel(parse_bus(bus))
+        return open_channel(parse_bus(bus) if isinstance(bus, str) else bus)
     except CanopenExoError as error:
         raise BenchError(str(error)) from error
 

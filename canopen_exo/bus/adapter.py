@@ -14,7 +14,7 @@ import errno
 import sys
 import time
 from collections.abc import Callable
-from typing import Final, final
+from typing import Any, Final, final
 
 import can
 import can.util
@@ -124,9 +124,11 @@ def open_python_can(interface: str, channel: str, bitrate: int | None, context: 
         known = ", ".join(sorted(can.VALID_INTERFACES))
         raise CanopenExoError(f"bus {name}: there is no interface {interface!r}; python-can has {known}")
     try:
-        if bitrate is None:
-            return can.Bus(channel=channel, interface=interface, config_context=context or None)
-        return can.Bus(channel=channel, interface=interface, config_context=context or None, bitrate=bitrate)
+        # a loop that hears itself answers itself: whatever python-can's configuration says, own frames stay away
+        given: dict[str, Any] = {"receive_own_messages": False}
+        if bitrate is not None:
+            given["bitrate"] = bitrate
+        return can.Bus(channel=channel, interface=interface, config_context=context or None, **given)
     except _REFUSALS as error:
         why = " ".join(str(error).split()).rstrip(".") or type(error).__name__
         raise CanopenExoError(
@@ -241,6 +243,8 @@ class PythonCanChannel(Channel):
             can_id = message.arbitration_id if len(data) == 8 else 0
             self._state = read_error_frame(can_id, data if len(data) == 8 else b"", self._state)
             arrivals.append(Arrival(stamp, None, self._state))
+            return
+        if not message.is_rx:  # our own, from an interface that gives them back all the same
             return
         frame = from_message(message)
         if frame is None:

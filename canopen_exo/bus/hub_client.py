@@ -5,6 +5,7 @@ our sending of the hello and our receiving of the welcome, both read the same cl
 are; otherwise (a hub on another machine) they are moved by the difference, good to half a round trip.
 """
 
+import logging
 import os
 import select
 import socket
@@ -44,10 +45,22 @@ from canopen_exo.errors import CanopenExoError
 JOIN_NS: Final = 2 * SECOND
 """How long a connection and its welcome may take."""
 
+_LOG: Final = logging.getLogger(__name__)
+
 _READ_SIZE: Final = 1 << 16
 _FIRST_RETRY_NS: Final = 100 * MS
 _LAST_RETRY_NS: Final = 2 * SECOND
 _JOIN_POLL_NS: Final = 10 * MS
+
+
+def addresses(host: str) -> set[str]:
+    """The addresses of a host; the host itself when it is not known. 0.0.0.0 and :: lead to this machine."""
+    try:
+        found = {str(one[4][0]) for one in socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)}
+    except OSError:
+        return {host}
+    here = {"0.0.0.0": "127.0.0.1", "::": "::1"}
+    return {here.get(one, one) for one in found}
 
 
 class HubError(CanopenExoError):
@@ -222,8 +235,9 @@ class HubLink:
 class HubChannel(Channel):
     """A hub's bus as the real-time loop sees it: `hub:NAME` or `hub:HOST:PORT/NAME`. `open` connects.
 
-    Its transmit queue is the hub's (timed: 64 frames, by arbitration); what that drops is counted in `lost`. When the
-    hub goes away it is looked for again, every 0.1 s at first and every 2 s at last.
+    Its transmit queue is the hub's (timed: 64 frames, by arbitration); what that drops is counted in `lost`, and
+    the first frame it rejects is told in the log. When the hub goes away it is looked for again, every
+    0.1 s at first and every 2 s at last.
     """
 
     def __init__(self, channel: str) -> None:
@@ -232,6 +246,7 @@ class HubChannel(Channel):
         self._state: PortState = PortState(0, ErrorState.DOWN, 0, 0, "not open")
         self._notices: list[Arrival] = []
         self._retry_ns: int = _FIRST_RETRY_NS
+        self._is_rejected: bool = False
         self._is_closed: bool = False
 
     def open(self) -> None:
@@ -321,33 +336,28 @@ class HubChannel(Channel):
                 else:
                     found.append(Arrival(stamp, unpack_frame(data, at), None))
             else:
-                self._told(data, at, kind, now, found)
+                self._told(data, at, kind)
                 if size == 0:
                     self.malformed += 1
                     raise HubError(f"hub {self._link.where()}: a record of unknown kind {kind} came")
             at += size
         return at
 
-    def _told(self, data: bytes, at: int, kind: int, now: int, found: list[Arrival]) -> None:
-        """A record that is no frame."""
+    def _told(self, data: bytes, at: int, kind: int) -> None:
+        """A record that is no frame. What was lost is counted; it says nothing about the state of the bus."""
         if kind == KIND_OVERRUN:
             count, which, _, _, _ = unpack_record(data, at)
             if which == LOST_RECEIVING:
                 self.overruns += count
-                cause = f"the hub dropped {count} frames because we did not read"
             else:
                 self.lost += count
-                cause = f"the hub dropped {count} of our frames: transmit queue full"
         elif kind == KIND_REJECTED:
             self.lost += 1
-            cause = f"the hub rejected a frame: {unpack_text(data, at)}"
+            if not self._is_rejected:
+                self._is_rejected = True
+                _LOG.warning("%s: the hub rejected a frame: %s", self.name, unpack_text(data, at))
         elif kind == KIND_REFUSED:
             raise HubError(f"hub {self._link.where()}: refused: {unpack_text(data, at)}")
-        else:
-            return
-        before = self._state
-        self._state = PortState(0, before.state, before.tec, before.rec, cause, overrun=kind == KIND_OVERRUN)
-        found.append(Arrival(now, None, self._state))
 
     def _lose(self, now: int, why: str) -> None:
         """The hub is away: a notice, and when it is looked for again."""

@@ -62,6 +62,36 @@ def parse_bus(text: str) -> BusName:
     return BusName(interface, channel, bitrate)
 
 
+def same_bus(one: BusName, other: BusName) -> bool:
+    """Whether both are one bus, however each is written; the bit rate makes no difference.
+
+    A hub is known by its address, host names resolved, and the bus's name; a device file by where its links lead.
+    Left out: one hub reached at two addresses of its machine, and two adapters plugged into one wire.
+    """
+    if one.interface != other.interface:
+        return False
+    return one.channel == other.channel or not _places(one).isdisjoint(_places(other))
+
+
+def bus_identity(bus: BusName) -> str:
+    """One text for all ways to write a bus, as far as `same_bus` sees it; raises as that does."""
+    host, port, name = min(_places(bus))
+    return f"{bus.interface}:{host}:{port}/{name}"
+
+
+def _places(bus: BusName) -> set[tuple[str, int, str]]:
+    """Where a channel leads: hosts, port and bus of a hub; raises CanopenExoError for a channel no hub can have."""
+    if bus.interface != "hub":
+        from os.path import realpath
+
+        return {("", 0, realpath(bus.channel) if bus.channel.startswith("/") else bus.channel)}
+    from canopen_exo.bus.hub_client import addresses
+    from canopen_exo.bus.hub_wire import split_channel
+
+    host, port, name = split_channel(bus.channel)
+    return {(address, port, name) for address in addresses(host)}
+
+
 def configured_bus(context: str = "") -> BusName | None:
     """The bus that python-can's configuration names; None when it names none.
 

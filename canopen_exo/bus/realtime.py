@@ -30,6 +30,7 @@ from typing import Final, Protocol, final
 
 from canopen_exo.bus.channel import Arrival, Channel, RecordArrival, RecordChannel
 from canopen_exo.bus.lateness import Lateness
+from canopen_exo.bus.losses import Losses
 from canopen_exo.bus.medium import Transmission
 from canopen_exo.bus.node import MS, NEVER, SECOND, Node, PortState, Relay
 from canopen_exo.bus.realtime_out import Line, RealTimeOut
@@ -107,7 +108,9 @@ class RealTimeLoop:
         self._node: Final[Node] = node
         self._clock: Final = clock
         self._wait: Final = wait
-        self._out: Final[RealTimeOut] = RealTimeOut(clock, epoch_ns, self.trace, measure_latency)
+        self._out: Final[RealTimeOut] = RealTimeOut(
+            clock, epoch_ns, self.trace, measure_latency, isinstance(node, Relay)
+        )
         self._lines: Final[list[Line]] = []
         self._readers: Final[dict[int, Callable[[int], None]]] = {}
         self._served: int = -NEVER
@@ -134,11 +137,20 @@ class RealTimeLoop:
 
     def losses(self) -> int:
         """Frames lost so far, either way: in full queues, by the kernel or the hub, at an absent interface."""
-        lost = sum(self.dropped)
-        for line in self._lines:
-            line.channel.count_overruns()
-            lost += line.channel.overruns + line.channel.lost
+        lost = 0
+        for one in self.losses_by_channel():
+            lost += one.queue_full + one.discarded + one.not_taken + one.overruns
         return lost
+
+    def losses_by_channel(self) -> list[Losses]:
+        """The same, and what was no frame, by channel; asks the kernel, so not for every frame."""
+        found: list[Losses] = []
+        for line in self._lines:
+            channel = line.channel
+            channel.count_overruns()
+            full = sum(self.dropped[port] for port in line.ports)
+            found.append(Losses(full, line.discarded, channel.lost, channel.overruns, channel.malformed))
+        return found
 
     def add_reader(self, source: Readable, callback: Callable[[int], None]) -> None:
         """Call `callback(now)`, between two calls of the node, whenever `source` is readable."""
@@ -304,6 +316,7 @@ class RealTimeLoop:
         if frame is not None:
             if self.trace is not None:
                 self.trace.append(Transmission(arrival.stamp_ns, line.index, frame, RECEIVED))
+            line.is_away = False
             if line.ports:
                 self._out.handled_ns = arrival.stamp_ns
                 self._node.receive(now, line.ports[0], frame, self._out)
@@ -314,14 +327,15 @@ class RealTimeLoop:
     def _notify(self, line: Line, state: PortState, now: int) -> None:
         """Every port of the node on this channel shares its state."""
         changed = state.state is not line.state
-        line.state = state.state
+        line.note(state.state)
         _LOG.log(
             logging.WARNING if changed else logging.DEBUG,
-            "%s: %s (TEC %d, REC %d): %s",
+            "%s: %s (TEC %d, REC %d) at %.3f s: %s",
             line.channel.name,
             state.state.value.replace("_", " "),
             state.tec,
             state.rec,
+            now / SECOND,
             state.cause,
         )
         for port in line.ports:

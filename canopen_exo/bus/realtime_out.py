@@ -1,6 +1,8 @@
 """The transmit side of the real-time loop: what a node sends, to the channels at once, or into their queues.
 
-A queue has the order and the length of a controller's (`medium`): lowest arbitration bits first, 64 frames.
+A queue has the length of a controller's (`medium`), 64 frames, and its order: lowest arbitration bits first. That of a
+relay is first in, first out: what comes from one bus is not to change its order on the way to the other.
+Nothing waits for an interface that is bus-off or down: no command is to come out after an outage that was given before.
 Leaves out: waiting until a channel takes frames again, which is the loop's.
 """
 
@@ -40,9 +42,12 @@ class Echo:
 
 @final
 class Line:
-    """A channel with the node's ports on it and the frames that wait for it, in the order in which they will go."""
+    """A channel with the node's ports on it and the frames that wait for it, in the order in which they will go.
 
-    __slots__ = ("channel", "fd", "index", "latency", "ports", "state", "waiting")
+    is_away: bus-off or down, until a notice or a received frame says otherwise; discarded: frames lost for that.
+    """
+
+    __slots__ = ("channel", "discarded", "fd", "index", "is_away", "latency", "ports", "state", "waiting")
 
     def __init__(self, index: int, channel: Channel) -> None:
         self.index: Final[int] = index
@@ -51,15 +56,28 @@ class Line:
         self.waiting: Final[list[Waiting]] = []
         self.latency: Final[Lateness] = Lateness()
         self.state: ErrorState = ErrorState.ERROR_ACTIVE
+        self.is_away: bool = False
+        self.discarded: int = 0
         self.fd: int = -1
+
+    def note(self, state: ErrorState) -> None:
+        """The interface has this state; what waits for one that is away is discarded and counted."""
+        self.state = state
+        self.is_away = state is ErrorState.BUS_OFF or state is ErrorState.DOWN
+        if self.is_away:
+            self.discarded += len(self.waiting)
+            self.waiting.clear()
 
 
 @final
 class RealTimeOut(Out):
-    """The transmit side of the node. handled_ns: stamp of the frame being handled, NEVER outside of `receive`."""
+    """The transmit side of the node. handled_ns: stamp of the frame being handled, NEVER outside of `receive`.
+
+    relay: what waits keeps its order, whatever its ids.
+    """
 
     def __init__(
-        self, clock: Callable[[], int], epoch_ns: int, trace: list[Transmission] | None, measure: bool
+        self, clock: Callable[[], int], epoch_ns: int, trace: list[Transmission] | None, measure: bool, relay: bool
     ) -> None:
         self.lines: Final[list[Line]] = []
         self.echoes: list[Echo] = []
@@ -69,19 +87,27 @@ class RealTimeOut(Out):
         self._epoch_ns: Final[int] = epoch_ns
         self._trace: Final = trace
         self._measure: Final[bool] = measure
+        self._is_fifo: Final[bool] = relay
 
     def send(self, port: int, frame: Frame) -> None:
-        """To the channel at once; into the queue of 64 while it would block; a full queue drops and counts it."""
+        """To the channel at once; into the queue of 64 while it would block; a full queue drops and counts it.
+
+        While the channel is away, at once or not at all.
+        """
         line = self.lines[port]
         if line.waiting or not self._try(line, port, frame, self.handled_ns):
+            if line.is_away:
+                line.discarded += 1
+                return
             waiting = line.waiting
             at = len(waiting)
             if at >= QUEUE_LENGTH:
                 self.dropped[port] += 1
                 return
-            arbitration = frame.arbitration
-            while at and waiting[at - 1].frame.arbitration > arbitration:
-                at -= 1
+            if not self._is_fifo:
+                arbitration = frame.arbitration
+                while at and waiting[at - 1].frame.arbitration > arbitration:
+                    at -= 1
             waiting.insert(at, Waiting(frame, port, self.handled_ns))
 
     def flush(self, line: Line) -> None:

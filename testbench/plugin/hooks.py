@@ -131,21 +131,21 @@ def named_buses(option: str) -> tuple[str, str] | None:
         return None
     if option == VCAN:
         return "socketcan:vcan0", "socketcan:vcan1"
-    from canopen_exo.bus.interfaces import parse_bus
+    from canopen_exo.bus.interfaces import parse_bus, same_bus
     from canopen_exo.errors import CanopenExoError
 
     names = option.split(",")
     if len(names) == 2 and ":" not in names[1]:
         names[1] = f"{names[0].partition(':')[0]}:{names[1]}"
     try:
-        if len(names) != 2 or names[0] == names[1]:
+        buses = [parse_bus(name) for name in names]
+        if len(buses) != 2 or same_bus(buses[0], buses[1]):
             raise CanopenExoError("two different buses are needed, controller and drive bus")
-        controller, drive = (str(parse_bus(name)) for name in names)
     except CanopenExoError as error:
         raise pytest.UsageError(
             f"--exo-bus {option}: {error}; allowed: {LOCKSTEP}, {HUB}, {VCAN}, or two buses such as socketcan:can0,can1"
         ) from error
-    return controller, drive
+    return str(buses[0]), str(buses[1])
 
 
 def _open(request: pytest.FixtureRequest) -> "Exo":

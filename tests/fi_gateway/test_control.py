@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from canopen_exo.bus.frame import FLAG_EXTENDED, FLAG_FD, FLAG_REMOTE, Frame
 from canopen_exo.bus.lateness import Lateness
+from canopen_exo.bus.losses import Losses
 from canopen_exo.bus.node import MS, NEVER, SECOND, ErrorState, Out, PortState
 from canopen_exo.signal import Signal
 from fi_gateway import bus_control as wire
@@ -21,6 +22,7 @@ from fi_gateway.control import (
     ControlRow,
     Direction,
     LiveControl,
+    changes_text,
     latency_text,
     listing_text,
     perform,
@@ -400,6 +402,46 @@ def test_statistics_count_what_faults_add() -> None:
     """Inserted frames are none that came in."""
     both = Direction("to_drives", 7, 1, 3, 0, 0, None)
     assert statistics_text([both]) == "to_drives: 7 frames, 1 lost by faults, 3 added"
+def test_statistics_say_what_was_lost_in_each_direction_and_where() -> None:
+    """On the way in at the one interface, on the way out at the other."""
+    losses = [Losses(1, 2, 3, 4, 5), Losses(10, 20, 30, 40, 50)]
+    drives, controller = statistics(live().gateway, None, losses)
+    assert statistics_text([drives, controller]).splitlines() == [
+        "to_drives: 0 frames, 0 lost by faults, 4 lost before they were read, 5 unreadable, 10 lost in a full queue, "
+        "20 discarded in an outage, 30 not taken by the interface",
+        "to_controller: 0 frames, 0 lost by faults, 40 lost before they were read, 50 unreadable, "
+        "1 lost in a full queue, 2 discarded in an outage, 3 not taken by the interface",
+    ]
+
+
+def test_changes_of_the_interfaces_are_told_with_their_times() -> None:
+    """The latest of each side, oldest first; notices that change nothing are only counted."""
+    control, sink = live(), Sink()
+    states = [
+        (ZERO, DRIVE_PORT, ErrorState.BUS_OFF, "bus-off"),
+        (ZERO + MS, CONTROLLER_PORT, ErrorState.DOWN, "interface gone"),
+        (ZERO + 2 * MS, CONTROLLER_PORT, ErrorState.DOWN, "still gone"),
+        (ZERO + 3 * MS, DRIVE_PORT, ErrorState.ERROR_ACTIVE, "controller restarted"),
+    ]
+    for time_ns, side, new, cause in states:
+        control.gateway.port_changed(time_ns, PortState(side, new, 0, 0, cause), sink)
+    assert changes_text(statistics(control.gateway, None)).splitlines() == [
+        "drive side: bus off at 0.100 s: bus-off",
+        "controller side: down at 0.101 s: interface gone",
+        "drive side: error active at 0.103 s: controller restarted",
+    ]
+
+
+def test_a_bus_that_flaps_leaves_its_latest_changes() -> None:
+    """Neither memory nor the answer to `list` grows without end, and what is told is not from days ago."""
+    control, sink = live(), Sink()
+    for number in range(5000):
+        new = ErrorState.DOWN if number % 2 else ErrorState.ERROR_ACTIVE
+        control.gateway.port_changed(number, PortState(DRIVE_PORT, new, 0, 0, "x" * 1000), sink)
+    assert len(control.gateway.port_changes) < 5000
+    _, controller = statistics(control.gateway, None)
+    assert [one.time_ns for one in controller.changes] == list(range(4984, 5000))
+    assert max(len(one.cause) for one in controller.changes) < 200
 
 
 def test_histogram_of_the_added_latency_is_said_in_octaves() -> None:

@@ -13,7 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from canopen_exo.bus.lateness import Lateness
-from canopen_exo.bus.node import MS, NEVER, SECOND
+from canopen_exo.bus.losses import Losses
+from canopen_exo.bus.node import MS, NEVER, SECOND, ErrorState, Out, PortState
 from canopen_exo.bus.realtime import RealTimeLoop
 from fi_gateway.control import LiveControl
 from fi_gateway.control_socket import IDLE_NS, MAX_CLIENTS, MAX_LINE, ControlServer, answer_request, ask, ask_listing
@@ -21,7 +22,7 @@ from fi_gateway.effects import ConstantTime
 from fi_gateway.errors import FaultError
 from fi_gateway.events import At
 from fi_gateway.faults import Drop
-from fi_gateway.gateway import Gateway
+from fi_gateway.gateway import DRIVE_PORT, Gateway
 from fi_gateway.injector import Injector, Target, stream
 
 PATIENCE_S = 10.0
@@ -65,7 +66,8 @@ class Bench:
     def __init__(self, address: str, live: LiveControl) -> None:
         self.live = live
         self.readers = Readers()
-        self.server = ControlServer(live, address, lambda: [Lateness(), Lateness()])
+        losses = [Losses(queue_full=1, not_taken=2), Losses(discarded=3, overruns=4, malformed=5)]
+        self.server = ControlServer(live, address, lambda: [Lateness(), Lateness()], lambda: losses)
         self.clients: list[socket.socket] = []
 
     def open(self) -> None:
@@ -171,6 +173,21 @@ def test_list_says_everything_about_the_gateway(bench: Bench) -> None:
     assert isinstance(directions, list)
     assert [one["direction"] for one in directions] == ["to_drives", "to_controller"]
     assert directions[0]["latency"]["count"] == 0
+    kinds = ("queue_full", "discarded", "not_taken", "overruns", "malformed")
+    assert [[one[kind] for kind in kinds] for one in directions] == [[0, 3, 0, 0, 0], [1, 0, 2, 4, 5]]
+
+
+def test_changes_of_the_interfaces_are_in_the_listing_with_their_times(bench: Bench) -> None:
+    """Reported with its time: as data, and as lines for people."""
+    state = PortState(DRIVE_PORT, ErrorState.BUS_OFF, 0, 0, "bus-off")
+    bench.live.gateway.port_changed(2 * MS, state, Out())
+    (answer,) = bench.say(bench.connect(), b'{"do":"list"}\n')
+    directions = answer["directions"]
+    assert isinstance(directions, list)
+    assert [one["changes"] for one in directions] == [[], [{"time_ns": 2 * MS, "state": "bus_off", "cause": "bus-off"}]]
+    (listing,) = served(bench, lambda: ask_listing(bench.server.address))
+    assert "drive side: bus off at 0.002 s: bus-off" in listing.text().splitlines()  # type: ignore[attr-defined]
+    assert [one.discarded for one in listing.directions] == [3, 0]  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize(

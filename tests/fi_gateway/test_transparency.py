@@ -25,6 +25,7 @@ from canopen_exo.bus import recvmmsg
 from canopen_exo.bus.frame import Frame
 from canopen_exo.bus.hub import HubServer, listen
 from canopen_exo.bus.hub_client import HubChannel
+from canopen_exo.bus.losses import Losses
 from canopen_exo.bus.node import NEVER, SECOND, ErrorState
 from canopen_exo.bus.realtime import RealTimeLoop
 from canopen_exo.bus.socketcan import SocketCanChannel
@@ -100,6 +101,7 @@ class Bench:
 
     def __init__(self, injectors: list[Injector], record: bool, pair: Callable[[], Pair]) -> None:
         self.gateway = Gateway(injectors, 2_000_000)
+        self.record = record
         self.far: list[socket.socket] = []
         self.channels: list[SocketCanChannel] = []
         self.came: list[list[bytes]] = [[], []]
@@ -114,10 +116,7 @@ class Bench:
         )
 
     def pass_all(self, given: list[list[bytes]], expected: list[int]) -> None:
-        """Offer four records of each side a turn, until the expected numbers have come out, and then a few turns more.
-
-        Four, so that no frame has to wait for a socket: what waits goes by arbitration, as in any CAN controller.
-        """
+        """Offer four records of each side a turn, until the expected numbers have come out, then a few turns more."""
         at, turns = [0, 0], 0
 
         def feed(now: int) -> bool:
@@ -236,6 +235,74 @@ def test_bus_off_on_one_side_loses_what_is_sent_there_and_ends_by_itself(bench: 
         assert made.came == [[classical(0x181, b"\1")], back]
 
 
+class Stalled(socket.socket):
+    """An interface whose queue is full (ENOBUFS) while `full`."""
+
+    full = True
+
+    def send(self, *given: object) -> int:
+        if self.full:
+            raise OSError(errno.ENOBUFS, "No buffer space available")
+        return super().send(*given)  # type: ignore[arg-type]
+
+
+@contextmanager
+def stalled(made: Bench) -> Iterator[Stalled]:
+    """The drive side, with a queue that is full."""
+    near, far = unix_pair()
+    far.setblocking(False)
+    opened = Stalled(fileno=near.detach())
+    made.channels[DRIVE_PORT].close()
+    made.far[DRIVE_PORT].close()
+    made.far[DRIVE_PORT] = far
+    made.channels[DRIVE_PORT] = SocketCanChannel("socketcan:stalled", lambda: opened)
+    made.loop = RealTimeLoop(made.gateway, list(made.channels), [0, 1], time.monotonic_ns(), record=made.record)
+    yield opened
+
+
+@pytest.fixture
+def readable_by_python(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A socket of our own class is not read by the kernel's recvmmsg."""
+    monkeypatch.setattr(recvmmsg, "find_recvmmsg", lambda: None)
+
+
+def test_frames_that_wait_for_a_busy_interface_keep_their_order(bench: MakeBench, readable_by_python: None) -> None:
+    """Whatever their ids: a command and the SYNC behind it must not change places on the way."""
+    records = [classical(number, b"\1") for number in (0x205, 0x605, 0x80, 0x205, 0x7FF, 0)]
+    with bench() as made, stalled(made) as drive:
+        made.pass_all([records, []], [0, 0])
+        assert made.came[DRIVE_PORT] == []
+        drive.full = False
+        made.pass_all([[], []], [0, len(records)])
+        assert made.came[DRIVE_PORT] == records
+        assert made.loop.losses() == 0
+
+
+def test_no_command_from_before_or_during_bus_off_comes_out_after_it(
+    bench: MakeBench, readable_by_python: None
+) -> None:
+    """A controller that is going bus-off stops taking frames (ENOBUFS) before the driver says so, and goes on so.
+
+    What waits then, and the frames by which the gateway tries whether it is back, are counted, not kept.
+    """
+    before = [classical(0x205, bytes((number,))) for number in range(6)]
+    during = [classical(0x205, bytes((100 + number,))) for number in range(6)]
+    with bench() as made, stalled(made) as drive:
+        made.pass_all([before, []], [0, 0])
+        made.pass_all([[], [classical(ERROR | 0x40, bytes(8))]], [0, 0])
+        for record in during:
+            made.gateway._probe_at[DRIVE_PORT] = -NEVER  # each of them tries
+            made.pass_all([[record], []], [0, 0])
+        assert made.gateway.undelivered == [0, 0]
+        drive.full = False
+        made.pass_all([[], [classical(ERROR | 0x100, bytes(8))]], [0, 0])
+        after = classical(0x205, b"\xff")
+        made.pass_all([[after], []], [0, 1])
+        assert made.came[DRIVE_PORT] == [after]
+        assert made.loop.losses_by_channel()[DRIVE_PORT] == Losses(discarded=len(before) + len(during))
+        assert made.loop.losses() == len(before) + len(during)
+
+
 def test_latency_is_measured_for_every_frame_sent(bench: MakeBench) -> None:
     """From the stamp of the frame to its sending, by direction."""
     with bench() as made:
@@ -315,6 +382,7 @@ def test_the_soak_recipe_runs() -> None:
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 0, done.stderr
     assert "50000 frames" in done.stdout
+    assert "5000 frames over busy buses" in done.stdout
 
 
 @pytest.mark.parametrize("towards_controller", [False, True])

@@ -3,24 +3,28 @@
 Real processes against the clock are in test_supervisor.py and test_realtime.py.
 """
 
+import argparse
 import os
 import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
+import can.util
 import pytest
+from can.interfaces.virtual import VirtualBus
 
 from canopen_exo.bus.channel import Arrival, Channel
 from canopen_exo.bus.frame import Frame
-from canopen_exo.bus.node import MS, NEVER, Node
+from canopen_exo.bus.interfaces import BusName, parse_bus
+from canopen_exo.bus.node import MS, NEVER, ErrorState, Node, PortState
 from fi_gateway.control import NAMED, WORDS
 from fi_gateway.control_socket import DEFAULT_ADDRESS
 from fi_gateway.gateway import CONTROLLER_PORT, DRIVE_PORT
-from testbench import cli_rig, process, supervisor
+from testbench import cli_rig, gateway_process, process, supervisor
 from testbench.cli import main
 from testbench.errors import BenchError
 from testbench.fault_file import faults_of
@@ -67,8 +71,8 @@ def channels(monkeypatch: pytest.MonkeyPatch) -> list[DeadChannel]:
     """Every interface that is opened is one of these."""
     opened: list[DeadChannel] = []
 
-    def open_dead(name: str) -> Channel:
-        opened.append(DeadChannel(name))
+    def open_dead(bus: BusName) -> Channel:
+        opened.append(DeadChannel(str(bus)))
         return opened[-1]
 
     monkeypatch.setattr(process, "open_bus", open_dead)
@@ -99,7 +103,7 @@ def test_joints_told_to_end_leave_their_part(
     """SIGTERM ends a process in order, part and all, and its interface is closed."""
     next(signalled).append(signal.SIGTERM)
     part = tmp_path / "joints.npz"
-    assert joints_main(scenario, "hub:drive", ProcessOptions(part=part)) == 0
+    assert joints_main(scenario, parse_bus("hub:drive"), ProcessOptions(part=part)) == 0
     assert read_joints(part).q.shape[1] == 6
     assert [(channel.name, channel.closed) for channel in channels] == [("hub:drive", True)]
 
@@ -110,7 +114,7 @@ def test_controller_told_to_end_before_it_began_leaves_at_once(
     """Asked for, so no failure: exit 0."""
     next(signalled).append(signal.SIGTERM)
     part = tmp_path / "hlc.npz"
-    assert hlc_main(scenario, "hub:controller", ProcessOptions(part=part), endless=True) == 0
+    assert hlc_main(scenario, parse_bus("hub:controller"), ProcessOptions(part=part), endless=True) == 0
     assert not read_hlc(part).completed
 
 
@@ -119,7 +123,7 @@ def test_controller_without_drives_gives_up_and_says_why(
 ) -> None:
     """Exit 1: no boot-up message within 1 s; nothing hangs."""
     part = tmp_path / "hlc.npz"
-    assert hlc_main(scenario, "hub:controller", ProcessOptions(part=part), endless=False) == 1
+    assert hlc_main(scenario, parse_bus("hub:controller"), ProcessOptions(part=part), endless=False) == 1
     (event,) = read_hlc(part).events
     assert "no boot-up message" in event.text
     assert event.text in capfd.readouterr().err
@@ -132,7 +136,7 @@ def test_frame_that_is_there_before_the_controller_begins_does_not_keep_it_from_
     """A bus is never silent when a process joins it: here the late answer to somebody's SDO request."""
     answer = Arrival(0, Frame(0x581, bytes.fromhex("4300100092010200")), None)
     monkeypatch.setattr(DeadChannel, "there_already", [answer])
-    assert hlc_main(scenario, "hub:controller", ProcessOptions(), endless=False) == 1
+    assert hlc_main(scenario, parse_bus("hub:controller"), ProcessOptions(), endless=False) == 1
     assert Frame(0x77F, b"\x00") in channels[0].sent  # and gave up for want of drives
 
 
@@ -143,10 +147,11 @@ def test_gateway_first_stops_injecting_and_ends_with_the_second_interrupt(
     next(signalled).extend([signal.SIGINT, signal.SIGINT])
     part = tmp_path / "gateway.npz"
     options = ProcessOptions(part=part)
-    assert gateway_main(faults_of(scenario), ("hub:controller", "hub:drive"), options, GatewayOptions()) == 0
+    buses = (parse_bus("virtual:controller"), parse_bus("virtual:drive"))
+    assert gateway_main(faults_of(scenario), buses, options, GatewayOptions()) == 0
     (row,) = read_gateway(part).controls
     assert (row.what, row.name, row.source, row.refused) == ("stop", "", "signal", "")
-    assert [channel.name for channel in channels] == ["hub:controller", "hub:drive"]
+    assert [channel.name for channel in channels] == ["virtual:controller", "virtual:drive"]
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1:TAKEN", "/no/such/folder/control"])
@@ -209,7 +214,7 @@ def test_folder_of_the_rig_goes_when_the_supervisor_is_gone_and_not_when_it_tell
     folder.mkdir()
     (folder / "scenario.yaml").touch()
     options = ProcessOptions(supervisor=os.getppid(), folder=folder)  # which is there, as far as anyone can see
-    with session("joints", Node(), ["hub:drive"], [0], options) as served:
+    with session("joints", Node(), [parse_bus("hub:drive")], [0], options) as served:
         signal.raise_signal(number)
         served.run(lambda now: served.orders.count > 0)
     assert folder.exists() == stays
@@ -227,16 +232,151 @@ def test_process_ends_when_its_supervisor_is_gone(
 ) -> None:
     """Where the kernel does not tell, the process looks by itself."""
     monkeypatch.setattr(process, "die_with", lambda supervisor: None)
-    with session("joints", Node(), ["hub:drive"], [0], ProcessOptions(supervisor=2**22 + 1)) as served:
+    with session("joints", Node(), [parse_bus("hub:drive")], [0], ProcessOptions(supervisor=2**22 + 1)) as served:
         served.run(lambda now: False)
 
 
 def test_nodes_begin_on_the_next_whole_millisecond(channels: list[DeadChannel]) -> None:
     """All processes share one epoch, so that the grids of physics and SYNC agree."""
-    with session("joints", Node(), ["hub:drive"], [0], ProcessOptions(epoch_ns=1)) as served:
+    with session("joints", Node(), [parse_bus("hub:drive")], [0], ProcessOptions(epoch_ns=1)) as served:
         assert served.start_ns % MS == 0
         assert 0 < served.start_ns - served.loop.now() + MS <= 2 * MS or served.start_ns <= served.loop.now()
         assert served.loop.epoch_ns == 1
+
+
+# --- what is lost ----------------------------------------------------------------------------------------------------
+
+
+def test_each_kind_of_loss_is_told_when_it_first_shows_and_left_in_the_part(
+    channels: list[DeadChannel], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A process without a part has nobody else to tell it to; a flood of losses is no flood of lines."""
+    with session("joints", Node(), [parse_bus("virtual:drive")], [0], ProcessOptions()) as served:
+        (channel,) = channels
+        channel.overruns = 2
+        served.run(lambda now: True)
+        channel.overruns, channel.lost, channel.malformed = 5, 3, 1
+        served.run(lambda now: True)
+        served.run(lambda now: True)
+        assert served.losses() == {"dropped by virtual:drive before they were read": 5, "not taken by virtual:drive": 3}
+        assert served.service().losses == served.losses()
+    told = [line for line in capsys.readouterr().err.splitlines() if "warning" in line]
+    assert [line.partition("; ")[0] for line in told] == [
+        "joints: warning: 2 frames dropped by virtual:drive before they were read",
+        "joints: warning: 3 frames not taken by virtual:drive",
+        "joints: warning: 1 frames unreadable from virtual:drive",
+    ]
+
+
+def test_gateway_says_by_direction_what_was_lost_and_when_an_interface_was_off(
+    scenario: Scenario,
+    channels: list[DeadChannel],
+    signalled: Iterator[list[int]],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """At its end, also without a part: losses on the way in and on the way out, changes with their time."""
+    next(signalled).append(signal.SIGTERM)
+    state = PortState(0, ErrorState.BUS_OFF, 0, 0, "bus-off")
+    monkeypatch.setattr(DeadChannel, "there_already", [Arrival(-1_500_000_000, None, state)])
+    monkeypatch.setattr(DeadChannel, "__init__", dead_with_losses(DeadChannel.__init__))
+    buses = (parse_bus("virtual:controller"), parse_bus("virtual:drive"))
+
+    def serve_once(served: process.Session, control: object, can_resume: bool) -> None:
+        turns = iter((False, True))
+        served.run(lambda now: next(turns))
+
+    monkeypatch.setattr(gateway_process, "_serve", serve_once)
+    assert gateway_main(faults_of(scenario), buses, ProcessOptions(), GatewayOptions()) == 0
+    said = capsys.readouterr().err.splitlines()
+    lost = "0 lost by faults, 2 lost before they were read, 1 unreadable, 3 not taken by the interface, 1 error notices"
+    assert f"gateway: to_drives: 0 frames, {lost}" in said
+    assert f"gateway: to_controller: 0 frames, {lost}" in said
+    assert "gateway: controller side: bus off at -1.500 s: bus-off" in said
+    assert "gateway: drive side: bus off at -1.500 s: bus-off" in said
+
+
+def dead_with_losses(begin: Callable[[DeadChannel, str], None]) -> Callable[[DeadChannel, str], None]:
+    """A channel that has lost frames already."""
+
+    def begin_so(channel: DeadChannel, name: str) -> None:
+        begin(channel, name)
+        channel.overruns, channel.lost, channel.malformed = 2, 3, 1
+
+    return begin_so
+
+
+# --- two buses, and one gateway between them -------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs abstract Unix sockets")
+def test_a_second_gateway_between_the_same_buses_is_refused(
+    scenario: Scenario, channels: list[DeadChannel], signalled: Iterator[list[int]]
+) -> None:
+    """With two, every frame would go round for ever; whichever way round and however the buses are written."""
+    next(signalled).append(signal.SIGTERM)
+    one, other = (parse_bus(f"hub:127.0.0.1:1/{name}{os.getpid()}") for name in "ab")
+    again = parse_bus(f"hub:127.0.0.1:1/b{os.getpid()}@500000")
+    third = parse_bus(f"hub:127.0.0.1:1/c{os.getpid()}")
+    options, given = ProcessOptions(), GatewayOptions()
+    with gateway_process.claimed((one, other)):
+        with pytest.raises(BenchError, match=r"another one stands between .* already"):
+            gateway_main(faults_of(scenario), (again, one), options, given)
+        assert channels == []  # before any interface was opened
+        assert gateway_main(faults_of(scenario), (other, third), options, given) == 0  # a chain of gateways
+    assert gateway_main(faults_of(scenario), (again, one), options, given) == 0
+
+
+@pytest.mark.parametrize(
+    ("controller", "drive"),
+    [
+        ("hub:drive", "hub:127.0.0.1:29536/drive"),
+        ("hub:0.0.0.0:29536/drive", "hub:drive"),
+        ("socketcan:can0", "socketcan:can0@500000"),
+        ("pcan:PCAN_USBBUS1@1000000", "pcan:PCAN_USBBUS1@500000"),
+    ],
+)
+def test_one_bus_under_two_names_is_refused(
+    controller: str,
+    drive: str,
+    capsys: pytest.CaptureFixture[str],
+    channels: list[DeadChannel],
+    signalled: Iterator[list[int]],
+) -> None:
+    """Between a bus and itself every frame would go round for ever: by `gateway`, and by `up` and `run --realtime`."""
+    next(signalled).append(signal.SIGTERM)
+    complaint = f"controller bus {controller} and drive bus {drive} are one bus"
+    assert main(["gateway", "--controller-bus", controller, "--drive-bus", drive]) == cli_rig.USAGE
+    assert complaint in capsys.readouterr().err
+    assert channels == []
+    with pytest.raises(BenchError, match=complaint):
+        cli_rig.named_buses(argparse.Namespace(controller_bus=controller, drive_bus=drive))
+
+
+@pytest.mark.parametrize("verb", ["joints", "hlc", "gateway"])
+def test_section_of_can_conf_reaches_the_interface(
+    verb: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, signalled: Iterator[list[int]]
+) -> None:
+    """What else an adapter needs (here: FD) stands in the section of its bus; the name alone would lose it."""
+    for key in list(os.environ):
+        if key.startswith("CAN_"):
+            monkeypatch.delenv(key)
+    path = tmp_path / "can.conf"
+    sections = [f"[{role}]\ninterface = virtual\nchannel = {role}\nfd = True\n" for role in ("controller", "drive")]
+    path.write_text("[default]\n" + "".join(sections))
+    monkeypatch.setattr(can.util, "CONFIG_FILES", [str(path)])
+    next(signalled).append(signal.SIGTERM)
+    opened: list[tuple[str, bool]] = []
+    begin = VirtualBus.__init__
+
+    def note(bus: VirtualBus, channel: str, **given: Any) -> None:
+        opened.append((channel, given.get("fd", False)))
+        begin(bus, channel=channel, **given)
+
+    monkeypatch.setattr(VirtualBus, "__init__", note)
+    assert main([verb]) == 0
+    expected = {"joints": ["drive"], "hlc": ["controller"], "gateway": ["controller", "drive"]}[verb]
+    assert opened == [(role, True) for role in expected]
 
 
 # --- command line ----------------------------------------------------------------------------------------------------

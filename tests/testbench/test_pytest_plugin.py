@@ -195,7 +195,8 @@ def test_buses_are_named_as_everywhere(option: str, buses: tuple[str, str] | Non
 
 
 @pytest.mark.parametrize(
-    "option", ["can0", "socketcan:can0", "socketcan:can0,socketcan:can0", "a:b,c:d,e:f", "", "x y:a,b"]
+    "option", ["can0", "socketcan:can0", "socketcan:can0,socketcan:can0", "socketcan:can0,can0@500000",
+     "hub:drive,hub:127.0.0.1:29536/drive", "a:b,c:d,e:f", "", "x y:a,b"]
 )
 def test_a_bus_that_is_none_ends_the_run_before_any_test(pytester: pytest.Pytester, option: str) -> None:
     """A usage error that says what is allowed."""

@@ -144,6 +144,30 @@ def test_frames_pass_both_ways_over_a_python_can_bus(pair: tuple[PythonCanChanne
     assert channel.receive() == []
 
 
+def test_own_frames_stay_away_whatever_is_configured(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`receive_own_messages` in python-can's configuration would make a gateway forward its own frames for ever."""
+    monkeypatch.setenv("CAN_CONFIG", '{"receive_own_messages": true}')
+    with open_python_can("virtual", "test_adapter_own", None) as bus:
+        bus.send(to_message(Frame(0x205, b"\1")))
+        assert bus.recv(timeout=0) is None
+
+
+def test_own_frames_an_interface_gives_back_all_the_same_are_passed_over() -> None:
+    """`Message.is_rx` says whose they are; error frames are not anybody's."""
+    bus = ScriptedBus()
+    bus.given = [
+        can.Message(arbitration_id=0x205, is_extended_id=False, data=b"\1", is_rx=False),
+        can.Message(arbitration_id=0x206, is_extended_id=False, data=b"\2"),
+        can.Message(arbitration_id=0x40, is_error_frame=True, data=bytes(8), is_rx=False),
+    ]
+    channel = opened(bus)
+    first, second = channel.receive()
+    assert first.frame == Frame(0x206, b"\2")
+    assert second.state is not None
+    assert second.state.state is ErrorState.BUS_OFF
+    assert channel.malformed == 0
+
+
 def test_loop_serves_a_bus_that_has_no_descriptor(pair: tuple[PythonCanChannel, can.BusABC]) -> None:
     """A reader with a short poll: the virtual bus has no fileno."""
     channel, other = pair

@@ -154,20 +154,22 @@ def socket_joined(address: str) -> Iterator[socket.socket]:
         link.detach()
 
 
-def test_timed_hub_rejects_fd_and_the_channel_counts_it_lost(start_hub: StartHub) -> None:
-    """A frame that is not carried makes a run invalid: counted, with the reason in a notice."""
+def test_timed_hub_rejects_fd_and_the_channel_counts_it_lost(
+    start_hub: StartHub, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A frame that is not carried makes a run invalid: counted, and the first one told with the reason."""
     hub = start_hub(1_000_000)
     with opened(hub.address) as channel:
-        assert channel.send(Frame(0x123, bytes(12), FLAG_FD))
-        found = wait(channel, lambda found: bool(found))
-        ((state, cause),) = causes(found)
-        assert state is ErrorState.ERROR_ACTIVE
-        assert cause.startswith("the hub rejected a frame: frame 123 not carried: CAN FD")
-        assert channel.lost == 1
+        for _ in range(3):
+            assert channel.send(Frame(0x123, bytes(12), FLAG_FD))
+        found = wait(channel, lambda _: channel.lost == 3)
+        assert causes(found) == []  # nothing is wrong with the bus
+        (told,) = caplog.messages
+        assert "the hub rejected a frame: frame 123 not carried: CAN FD" in told
 
 
 def test_overflow_of_the_hubs_transmit_queue_is_counted_lost(start_hub: StartHub) -> None:
-    """64 frames wait at most; the rest is dropped, told and counted."""
+    """64 frames wait at most; the rest is dropped and counted, which is no notice about the state of the bus."""
     hub = start_hub(10_000)  # 11 ms for a frame: the queue is full long before one has left
     with opened(hub.address) as channel:
         surplus = 10
@@ -175,11 +177,10 @@ def test_overflow_of_the_hubs_transmit_queue_is_counted_lost(start_hub: StartHub
             link.send(pack_frame(Frame(1, bytes(8))) * (QUEUE_LENGTH + surplus))  # one piece: nothing leaves meanwhile
             link.detach()
         found = wait(channel, lambda _: channel.lost == surplus)
-        cause = f"the hub dropped {surplus} of our frames: transmit queue full"
-        assert causes(found) == [(ErrorState.ERROR_ACTIVE, cause)]
+        assert causes(found) == []
 
 
-def test_frames_missed_are_counted_and_told(start_hub: StartHub) -> None:
+def test_frames_missed_are_counted(start_hub: StartHub) -> None:
     """A channel that was not read for long: what is missing is counted in `overruns`, kept + missed = sent."""
     hub = start_hub()
     # more than the hub keeps and the kernel keeps on both sides as a rule
@@ -188,8 +189,7 @@ def test_frames_missed_are_counted_and_told(start_hub: StartHub) -> None:
         record = pack_frame(Frame(1, bytes(64), FLAG_FD))
         sender.sendall(record * sent)
         found = wait(sleeper, lambda found: len(frames(found)) + sleeper.overruns == sent)
-        if sleeper.overruns:  # how much a kernel keeps is its own affair
-            assert any(cause.startswith("the hub dropped") for _, cause in causes(found))
+        assert causes(found) == []
 
 
 def test_lost_hub_is_noticed_once_and_found_again(start_hub: StartHub) -> None:

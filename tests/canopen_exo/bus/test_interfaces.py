@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from canopen_exo.bus.interfaces import BusName, configured_bus, open_channel, parse_bus
+from canopen_exo.bus.interfaces import BusName, bus_identity, configured_bus, open_channel, parse_bus, same_bus
 from canopen_exo.errors import CanopenExoError
 
 
@@ -49,6 +49,35 @@ def test_bit_rate_is_a_whole_number_up_to_1_mbit(bits: str) -> None:
     """ISO 11898-2: 1 Mbit/s at most (the arbitration phase, for CAN FD)."""
     with pytest.raises(CanopenExoError, match=r"allowed 1\.\.1000000 bit/s"):
         parse_bus(f"pcan:PCAN_USBBUS1@{bits}")
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "same"),
+    [
+        ("hub:drive", "hub:127.0.0.1:29536/drive", True),
+        ("hub:drive", "hub:drive@500000", True),
+        ("hub:0.0.0.0:5000/drive", "hub:127.0.0.1:5000/drive", True),
+        ("hub:127.0.0.1:5000/drive", "hub:drive", False),
+        ("hub:127.0.0.2:29536/drive", "hub:drive", False),
+        ("hub:controller", "hub:drive", False),
+        ("socketcan:can0", "socketcan:can0@500000", True),
+        ("socketcan:can0", "socketcan:can1", False),
+        ("socketcan:can0", "virtual:can0", False),
+        ("pcan:PCAN_USBBUS1@1000000", "pcan:PCAN_USBBUS1@500000", True),
+    ],
+)
+def test_a_bus_is_the_same_however_it_is_written(one: str, other: str, same: bool) -> None:
+    """Interface, address of the hub, channel; the bit rate makes no other bus of it."""
+    first, second = parse_bus(one), parse_bus(other)
+    assert (same_bus(first, second), same_bus(second, first)) == (same, same)
+    assert (bus_identity(first) == bus_identity(second)) == same
+
+
+def test_a_device_file_is_known_by_where_its_links_lead(tmp_path: Path) -> None:
+    """/dev/serial/by-id/... and /dev/ttyACM0."""
+    (tmp_path / "ttyACM0").touch()
+    (tmp_path / "by-id").symlink_to(tmp_path / "ttyACM0")
+    assert same_bus(parse_bus(f"slcan:{tmp_path}/by-id"), parse_bus(f"slcan:{tmp_path}/ttyACM0@500000"))
 
 
 @given(st.text(max_size=30))

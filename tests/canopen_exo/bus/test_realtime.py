@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 
 from canopen_exo.bus.channel import Arrival, Channel
 from canopen_exo.bus.frame import Frame
+from canopen_exo.bus.losses import Losses
 from canopen_exo.bus.medium import QUEUE_LENGTH
-from canopen_exo.bus.node import MS, NEVER, ErrorState, Node, Out, PortState
+from canopen_exo.bus.node import MS, NEVER, ErrorState, Node, Out, PortState, Relay
 from canopen_exo.bus.realtime import RECEIVED, RealTimeLoop
 from canopen_exo.errors import CanopenExoError
 
@@ -364,9 +365,73 @@ def test_queue_holds_64_frames_and_counts_what_it_drops(extra: int) -> None:
     loop.run(until(world, 2 * MS))
     assert loop.dropped == [extra]
     assert loop.losses() == extra
+    assert loop.losses_by_channel() == [Losses(queue_full=extra)]
     channel.takes = 1 << 30
     loop.run(until(world, 3 * MS))
     assert channel.sent == frames[:QUEUE_LENGTH]
+
+
+AWAY = [ErrorState.BUS_OFF, ErrorState.DOWN]
+
+
+@pytest.mark.parametrize("state", AWAY)
+def test_nothing_that_waits_outlives_an_outage(state: ErrorState) -> None:
+    """After bus-off or interface down no old command comes out: what waits is discarded and counted, by channel."""
+    world = World()
+    channel = world.channels[0]
+    channel.takes = 0
+    node = Sender(FRAMES)
+    loop = world.loop(node, [0])
+    world.at(5 * MS, lambda: channel.inbox.append(Arrival(5 * MS, None, PortState(0, state, 0, 0, ""))))
+    loop.run(until(world, 6 * MS))
+    assert loop.losses_by_channel() == [Losses(discarded=len(FRAMES))]
+    channel.takes = 9
+    loop.run(until(world, 9 * MS))
+    assert (channel.sent, loop.losses()) == ([], len(FRAMES))
+
+
+@pytest.mark.parametrize("state", AWAY)
+@pytest.mark.parametrize("sign", [Frame(0x181, b""), PortState(0, ErrorState.ERROR_ACTIVE, 0, 0, "restarted")])
+def test_nothing_waits_for_an_interface_that_is_off(state: ErrorState, sign: Frame | PortState) -> None:
+    """While it is off a frame is sent at once or not at all; a notice or a received frame ends that."""
+    world = World()
+    channel = world.channels[0]
+    channel.takes = 0
+    channel.inbox.append(Arrival(0, None, PortState(0, state, 0, 0, "")))
+    node = Sender(FRAMES[:2])
+    loop = world.loop(node, [0])
+    loop.run(until(world, 2 * MS))
+    assert (loop.losses_by_channel(), channel.sent) == ([Losses(discarded=2)], [])
+    is_frame = isinstance(sign, Frame)
+    channel.inbox.append(Arrival(3 * MS, sign if is_frame else None, None if is_frame else sign))  # type: ignore[arg-type]
+    node.wake_at = 4 * MS
+    loop.run(until(world, 5 * MS))
+    channel.takes = 9
+    loop.run(until(world, 6 * MS))
+    assert channel.sent == [FRAMES[1], FRAMES[0]]  # waited, as ever, and went by arbitration
+    assert loop.losses() == 2
+
+
+def test_a_relay_keeps_the_order_of_frames_that_wait() -> None:
+    """Reordering by the gateway without a fault asking for it: none, whatever the ids and however busy the bus."""
+
+    class SendingRelay(Relay):
+        def __init__(self) -> None:
+            super().__init__()
+            self.wake_at = MS
+
+        def wake(self, now: int, out: Out) -> None:
+            self.wake_at = NEVER
+            for frame in FRAMES:
+                out.send(1, frame)
+
+    world = World(2)
+    channel = world.channels[1]
+    channel.takes = 1
+    world.at(5 * MS, lambda: setattr(channel, "takes", 9))
+    world.loop(SendingRelay(), [0, 1]).run(until(world, 6 * MS))
+    assert channel.sent == FRAMES
+    assert channel.sent_at == [MS, 5 * MS, 5 * MS, 5 * MS]
 
 
 def test_losses_add_up_what_queues_kernel_and_interfaces_lost() -> None:
@@ -374,7 +439,10 @@ def test_losses_add_up_what_queues_kernel_and_interfaces_lost() -> None:
     world = World(2)
     world.channels[0].overruns = 3
     world.channels[1].lost = 4
-    assert world.loop(Diary(), [0, 1]).losses() == 7
+    world.channels[1].malformed = 5
+    loop = world.loop(Diary(), [0, 1])
+    assert loop.losses() == 7
+    assert loop.losses_by_channel() == [Losses(overruns=3), Losses(not_taken=4, malformed=5)]
 
 
 def test_own_frame_reaches_another_port_on_the_same_channel_once() -> None:
