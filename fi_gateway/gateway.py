@@ -200,9 +200,10 @@ class Gateway(Relay):
             self._flush(now, out)
 
     def port_changed(self, now: int, state: PortState, out: Out) -> None:
-        """Count the notice, note what changed, and stop or resume sending there."""
+        """Count the notice, note what changed, and stop or resume sending there. Overruns are counted as losses."""
         port = state.port
-        self.notices[port] += 1
+        if not state.overrun:
+            self.notices[port] += 1
         if state.state is not self._states[port]:
             self._change(now, port, state.state, state.cause)
 

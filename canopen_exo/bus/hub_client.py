@@ -336,17 +336,20 @@ class HubChannel(Channel):
                 else:
                     found.append(Arrival(stamp, unpack_frame(data, at), None))
             else:
-                self._told(data, at, kind)
+                self._told(now, data, at, kind, found)
                 if size == 0:
                     self.malformed += 1
                     raise HubError(f"hub {self._link.where()}: a record of unknown kind {kind} came")
             at += size
         return at
 
-    def _told(self, data: bytes, at: int, kind: int) -> None:
-        """A record that is no frame. What was lost is counted; it says nothing about the state of the bus."""
+    def _told(self, now: int, data: bytes, at: int, kind: int, found: list[Arrival]) -> None:
+        """A record that is no frame. What was lost is counted, and told as an overrun; the state of the bus stays."""
         if kind == KIND_OVERRUN:
             count, which, _, _, _ = unpack_record(data, at)
+            before = self._state
+            cause = f"the hub dropped {count} frames"
+            found.append(Arrival(now, None, PortState(0, before.state, before.tec, before.rec, cause, overrun=True)))
             if which == LOST_RECEIVING:
                 self.overruns += count
             else:

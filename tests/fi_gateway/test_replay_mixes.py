@@ -80,7 +80,8 @@ def mixes(draw: st.DrawFn) -> str:
         sources = ranks[: ranks.index(name)]
         if sources and draw(st.booleans()):
             chosen = draw(st.lists(st.sampled_from(sources), min_size=1, unique=True))
-            on, key = draw(st.sampled_from(("activated", "manifested", "ended"))), draw(st.sampled_from(("any", "all")))
+            on = draw(st.sampled_from(("activated", "manifested", "ended")))
+            key = draw(st.sampled_from(("any", "all")))
             rest = draw(st.sampled_from(("", ", delay: 1.2 ms", ", probability: 50 %", ", edge: level")))
             text += f", trigger: {{{key}: [{', '.join(chosen)}], on: {on}{rest}}}"
         if draw(st.integers(0, 3)) == 0:
@@ -148,7 +149,7 @@ def test_a_replay_sends_the_same_frames_at_the_same_times(text: str, seed: int) 
 
 
 def on_wire(sink: Sink) -> list[tuple[int, int, int, bytes, int]]:
-    """As a transmit queue orders it: of what leaves at one instant the lowest id first, those of one id as they came."""
+    """As a transmit queue has it: of what leaves at one instant the lowest id first, those of one id as they came."""
     return sorted(sink.sent, key=lambda row: row[:3])
 
 
