@@ -41,7 +41,7 @@ Parts = tuple[HlcPart, GatewayPart, JointsPart]
 
 
 def service() -> Service:
-    return Service(0, 0, Lateness(), {})
+    return Service(0, NEVER, Lateness(), {})
 
 
 def seen_by(rig: Rig, bus: int, index: int, own: dict[int, int]) -> list[tuple[int, Transmission]]:
@@ -154,7 +154,7 @@ def test_lock_step_run_has_no_late_cycle_and_lost_nothing(scenario: Scenario, pa
 def test_what_one_process_lost_is_named(scenario: Scenario, parts: Parts) -> None:
     """Invalid when a frame was lost: queues, kernel, hub."""
     hlc, gateway, joints = parts
-    losing = replace(gateway, service=Service(0, 0, Lateness(), {"dropped by vcan0 before they were read": 4}))
+    losing = replace(gateway, service=Service(0, NEVER, Lateness(), {"dropped by vcan0 before they were read": 4}))
     timing = judged(scenario, hlc, losing, joints)
     assert timing.lost == ["gateway: 4 frames dropped by vcan0 before they were read"]
     assert timing.counted == 4
