@@ -177,7 +177,7 @@ def _joints(options: argparse.Namespace) -> int:
 
 
 def _hlc(options: argparse.Namespace) -> int:
-    """The high-level controller on the controller bus: boots the drives, walks, disables them; exit 1 if it gave up."""
+    """The high-level controller on the controller bus: boots the drives, walks, disables them; exit 4 if it gave up."""
     from testbench.process import hlc_main
 
     def serve(how: "ProcessOptions") -> int:

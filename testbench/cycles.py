@@ -136,9 +136,8 @@ def judge_drives(judge: CycleJudge, rows: list[Transmission], answers: set[int],
                 judge.follow(rows[place], rows[causes[place]])
                 judge.judge(rows[place], "joints sent", syncs)
         missing.get(can_id, set()).difference_update(causes.values())
-    for can_id, left in missing.items():
-        for place in left:
-            judge.miss(judge.cycle(rows[place]), f"joints sent no {can_id:03X}")
+    for place, can_id in sorted((place, can_id) for can_id, places in missing.items() for place in places):
+        judge.miss(judge.cycle(rows[place]), f"joints sent no {can_id:03X}")
 
 
 def _matters(row: Transmission, answers: set[int]) -> bool:

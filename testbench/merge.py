@@ -75,7 +75,25 @@ def merge(
         completed=given_up is None if hlc is None else hlc.completed,
         held_cycles=[0] * len(plan.joints) if hlc is None else list(hlc.held),
         source=PLANT if joints is not None else BUS,
+        invalid_reasons=_zeros_apart(plan, hlc, gateway),
     )
+
+
+def _zeros_apart(plan: BusPlan, hlc: HlcPart | None, gateway: GatewayPart | None) -> list[str]:
+    """Faults count from the gateway's time 0, truth and commands from the controller's: why they are not the same."""
+    if hlc is None or gateway is None:
+        return []
+    if gateway.time_zero == NEVER:
+        return ["the gateway never learned time 0: no status frame of the controller (COB-ID 0x2FF) came to it"]
+    apart_ns = gateway.time_zero - hlc.time_zero
+    if abs(apart_ns) < plan.cycle_ns:
+        return []
+    which = "late" if apart_ns > 0 else "early"
+    return [
+        f"the gateway's time 0, from which faults count, is {abs(apart_ns) / 1e6:.1f} ms {which} of the controller's, "
+        f"allowed is less than a cycle ({plan.cycle_ns / 1e6:g} ms): it missed a SYNC or a status frame, or somebody "
+        "said `exo-hil fault start` although the controller tells time 0"
+    ]
 
 
 def time_zero_of(

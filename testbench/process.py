@@ -34,8 +34,8 @@ if TYPE_CHECKING:  # numpy, and with it everything heavy
     from testbench.scenario import Scenario
 
 DONE: Final = 0
-ENDED_EARLY: Final = 1
-"""The controller gave the motion up; its part says why."""
+ENDED_EARLY: Final = 4
+"""The controller gave the motion up; its part says why. No code that a crash has: 1 is the interpreter's own."""
 
 LEAVE_NS: Final = SECOND
 """Most that the controller may take to disable the drives once told to end."""
@@ -196,7 +196,7 @@ def joints_main(scenario: "Scenario", bus: str, options: ProcessOptions) -> int:
 
 
 def hlc_main(scenario: "Scenario", bus: str, options: ProcessOptions, endless: bool) -> int:
-    """The high-level controller: one motion, or with `endless` until told to end. 1 when it gave up."""
+    """The high-level controller: one motion, or with `endless` until told to end. ENDED_EARLY when it gave up."""
     from hlc.node import Phase
     from testbench.rig import build_master, build_mechanics
     from testbench.run import motion_over, rig_params

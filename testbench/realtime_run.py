@@ -198,7 +198,9 @@ def _gather(rig: Supervisor, setup: Setup) -> RealTimeRun:
         raise IncompleteError(f"{error}; wake-ups served late: {'; '.join(served)}") from error
     zero = time_zero_of(plan, hlc, gateway, rig.rows)
     cycles = duration_ns // plan.cycle_ns if hlc is None else int(hlc.cycles.size)
-    timing = judge_timing(plan, zero, cycles, hlc, gateway, joints)
+    timing = judge_timing(
+        plan, zero, cycles, hlc, gateway, joints, rig.rows, missed=rig.missed, golden=not setup.faults
+    )
     add_reasons(record, timing.reasons(limits_in(setup.scenario)), golden=not setup.faults)
     return RealTimeRun(record, timing)
 
@@ -232,6 +234,7 @@ def _timing_run(timing: Timing) -> RealTimeRunEntry:
         "late_cycles": len(timing.late),
         "worst_late_ms": timing.late_worst_ns / 1e6,
         "worst": timing.worst,
+        "not_judged": timing.unjudged,
         "lateness": {name: lateness.document() for name, lateness in timing.lateness.items()},
         "latency": {bus: latency.document() for bus, latency in timing.latency.items()},
     }

@@ -124,12 +124,15 @@ class EventEntry(TypedDict):
 
 
 class RealTimeRunEntry(TypedDict):
-    """One real-time run. lateness: of wake-ups, by process; latency: added by the gateway, by the bus it sent on."""
+    """One real-time run. not_judged: what is foreign, in words; lateness: of wake-ups, by process; latency: added by the
+    gateway, by the bus it sent on.
+    """
 
     cycles: int
     late_cycles: int
     worst_late_ms: float
     worst: str
+    not_judged: list[str]
     lateness: dict[str, LatenessDocument]
     latency: dict[str, LatenessDocument]
 

@@ -117,9 +117,9 @@ def test_controller_told_to_end_before_it_began_leaves_at_once(
 def test_controller_without_drives_gives_up_and_says_why(
     scenario: Scenario, channels: list[DeadChannel], tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """Exit 1: no boot-up message within 1 s; nothing hangs."""
+    """Its own exit code, which no crash has: no boot-up message within 1 s; nothing hangs."""
     part = tmp_path / "hlc.npz"
-    assert hlc_main(scenario, "hub:controller", ProcessOptions(part=part), endless=False) == 1
+    assert hlc_main(scenario, "hub:controller", ProcessOptions(part=part), endless=False) == ENDED_EARLY
     (event,) = read_hlc(part).events
     assert "no boot-up message" in event.text
     assert event.text in capfd.readouterr().err
@@ -132,7 +132,7 @@ def test_frame_that_is_there_before_the_controller_begins_does_not_keep_it_from_
     """A bus is never silent when a process joins it: here the late answer to somebody's SDO request."""
     answer = Arrival(0, Frame(0x581, bytes.fromhex("4300100092010200")), None)
     monkeypatch.setattr(DeadChannel, "there_already", [answer])
-    assert hlc_main(scenario, "hub:controller", ProcessOptions(), endless=False) == 1
+    assert hlc_main(scenario, "hub:controller", ProcessOptions(), endless=False) == ENDED_EARLY
     assert Frame(0x77F, b"\x00") in channels[0].sent  # and gave up for want of drives
 
 
