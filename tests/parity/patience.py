@@ -26,6 +26,13 @@ _TIMING: Final = re.compile(
     r"timing: (\d+) of (\d+) cycles late, SYNC off by at most ([\d.]+) ms; (\d+) frames not heard"
 )
 
+_LATE: Final = ("cycles late (", "a cycle late by ", "the motion was given up without a fault", "the controller's deadline")
+"""In the reasons of an invalid run: what a machine that is too busy does to it."""
+
+_LATEST: Final = re.compile(r"the latest ([\d.]+) ms")
+_COUNTED: Final = re.compile(r": (\d+) frames (?:dropped|not taken|of both buses not heard)")
+_LOST: Final = re.compile(r"\((\d+)\)")
+
 T = TypeVar("T")
 
 
@@ -65,6 +72,25 @@ class Patience:
 def distributions(lateness: Mapping[str, Lateness]) -> str:
     """By name, in words, for the reason of a skip."""
     return ", ".join(f"{name}: {one.words()}" for name, one in lateness.items() if one.count)
+
+
+def is_lateness(reasons: list[str], cycle_ms: float) -> bool:
+    """Whether these reasons against a run all say that the machine was too busy; anything else is a defect.
+
+    A process that stands still overruns queues with what it catches up: those count what they drop, and no frame more
+    may be missing. A motion that never began, or a plant that ended before it, is due to the machine only where
+    wake-ups were served late, by half a cycle at least.
+    """
+    counted = sum(int(number) for reason in reasons for number in _COUNTED.findall(reason))
+    lost = [reason for reason in reasons if "lost: " in reason or "doubled or out of order: " in reason]
+    late = [
+        reason
+        for reason in reasons
+        if any(word in reason for word in _LATE)
+        or max(map(float, _LATEST.findall(reason)), default=0.0) >= cycle_ms / 2
+    ]
+    rest = [reason for reason in reasons if reason not in late and reason not in lost and not _COUNTED.search(reason)]
+    return bool(late) and not rest and sum(int(one) for reason in lost for one in _LOST.findall(reason)) <= counted
 
 
 def told_late(output: str, cycle_ms: float) -> list[str]:

@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.parity.patience import TRIES, Late, Patience, told_late
+from tests.parity.patience import TRIES, Late, Patience, is_lateness, told_late
 
 
 class Machine:
@@ -79,3 +79,31 @@ def test_punctual_runs_use_no_patience_up() -> None:
 def test_failure_of_a_users_test_is_a_matter_of_lateness_only_when_it_says_so(line: str, is_late: bool) -> None:
     """A failure in a rig that kept time (10 ms cycle) is a failure."""
     assert told_late(f"before\n{line}\nafter\n", 10.0) == ([line] if is_late else [])
+
+
+BUSY = "golden run: 10 of 200 cycles late (5.0 %), allowed 1 %: cycle 8, joints sent 181"
+FULL = "joints: 3 frames dropped at port 0, its transmit queue was full"
+
+
+@pytest.mark.parametrize(
+    ("reasons", "late"),
+    [
+        ([BUSY], True),
+        ([BUSY, "golden run: a cycle late by 43.8 ms, allowed 20 ms: cycle 8, joints sent 181"], True),
+        (["the motion was given up without a fault", BUSY], True),
+        (["the motion never began: x; wake-ups served late: hlc 9, 50 % within 0.1 ms, the latest 5.0 ms"], True),
+        (["the motion never began: x; wake-ups served late: hlc 9, 50 % within 0.1 ms, the latest 4.9 ms"], False),
+        (["the motion never began: no status frame"], False),
+        ([BUSY, FULL, "drive bus, frames from joints to gateway: lost: 181 (2), 182 (1)"], True),
+        ([BUSY, FULL, "drive bus, frames from joints to gateway: lost: 181 (2), 182 (2)"], False),
+        ([BUSY, FULL, "drive bus, frames from joints to gateway: doubled or out of order: 181 (4)"], False),
+        ([BUSY, "gateway, frames to the drives that no fault was at: lost: 205 (1)"], False),
+        ([FULL], False),
+        ([BUSY, "joints: it left no part of the result"], False),
+        (["gateway was killed by SIGKILL"], False),
+        ([], False),
+    ],
+)
+def test_only_lateness_is_forgiven(reasons: list[str], late: bool) -> None:
+    """Each promise of the rig fails its tests on a busy machine too: nothing lost uncounted, every part there."""
+    assert is_lateness(reasons, 10.0) == late

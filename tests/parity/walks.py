@@ -20,7 +20,7 @@ from testbench.run import rig_params, run_rig
 from testbench.scenario import JOINT_NAMES, Scenario, parse_scenario
 from testbench.supervisor import Setup
 from testbench.verdict import Judgement, judge
-from tests.parity.patience import Late, Patience, distributions
+from tests.parity.patience import Late, Patience, distributions, is_lateness
 
 VERDICTS: Final = {"none": True, "bias": True, "freeze": False}
 """Whether a scenario passes."""
@@ -90,19 +90,21 @@ Walks = Callable[[str], Pair]
 
 
 def attempt_run(setup: Setup) -> RealTimeRun | Late:
-    """One run. Nothing is lost in it, late or not, unless somebody counted it."""
+    """One run; late, or it must be valid. Nothing is lost in it, late or not, unless somebody counted it."""
+    cycle_ms = setup.scenario.plan.cycle_ns / 1e6
     try:
         run = run_once(setup)
     except IncompleteError as error:  # drives that miss SYNC for five cycles stop by themselves
+        assert is_lateness([str(error)], cycle_ms), error
         return Late(str(error))
-    # A process that stands still overruns a transmit queue of 64 frames with what it catches up.
-    assert not run.timing.lost or run.timing.counted, run.timing.lost
-    reasons = run.timing.reasons(limits_in(setup.scenario)) or list(run.record.invalid_reasons)
+    assert run.timing.found <= run.timing.counted, run.timing.lost
+    reasons = list(dict.fromkeys([*run.timing.reasons(limits_in(setup.scenario)), *run.record.invalid_reasons]))
     held, samples = sum(run.record.held_cycles), 6 * run.timing.cycles
-    if not reasons and held > HELD_SHARE * samples:
+    if held > HELD_SHARE * samples:
         reasons.append(f"{held} of {samples} samples came after the controller's deadline")
     if not reasons:
         return run
+    assert is_lateness(reasons, cycle_ms), reasons
     return Late(f"{', '.join(reasons)}; {distributions(run.timing.lateness | run.timing.latency)}")
 
 

@@ -17,13 +17,12 @@ from typing import Any
 import pytest
 
 from testbench.cli import main
-from tests.parity.patience import Late, Patience
+from tests.parity.patience import Late, Patience, is_lateness
 from tests.testbench.foreign import Drives
 
 pytestmark = pytest.mark.realtime
 
-LATE = ("cycles late", "a cycle late", "given up without a fault", "lost, doubled", "dropped", "NotInTimeError")
-"""What a machine that is too busy does to a run."""
+CYCLE_MS = 10.0
 
 BASE = """\
 name: foreign
@@ -94,7 +93,8 @@ def late_or(outcome: Outcome) -> Outcome | Late:
     if outcome.code != 3:
         return outcome
     reasons = outcome.document.get("invalid_reasons") or outcome.said[-1:]
-    assert any(word in f"{reasons}{outcome.foreign}" for word in LATE), outcome
+    # a foreign program that says so itself was not served in time either
+    assert is_lateness(reasons, CYCLE_MS) or "NotInTimeError" in outcome.foreign, outcome
     return Late("; ".join(map(str, reasons)))
 
 
@@ -173,9 +173,25 @@ def test_run_with_can_bridge_for_the_gateway(tmp_path: Path, patience: Patience)
     assert document["golden"]["tracking_rmse_rad"]["right_knee"] < 0.03
     for bus in ("controller", "drive"):
         assert document["bus"][bus]["frames"] > 100 * (1 + 6 + 6)
+    assert document["realtime"]["golden"]["not_judged"] == ["gateway: foreign: what it delays and adds"]
+    assert document["realtime"]["faulted"]["not_judged"] == ["gateway: foreign: what it loses, delays and adds"]
     log = (tmp_path / "result" / "drive.log").read_text().splitlines()
     assert any(" 205#" in line for line in log)
     assert any(" 185#" in line for line in log)
+
+
+def test_run_with_a_gateway_that_loses_frames_is_invalid(tmp_path: Path) -> None:
+    """Every tenth answer of the right knee goes in and does not come out: in a golden run there is no reason to."""
+
+    def bridge(line: str) -> list[str] | None:
+        found = re.fullmatch(r"golden run: waiting for a gateway between hub:(\S+) and hub:(\S+): it must .*", line)
+        return None if found is None else [str(PROGRAM), "bridge", *found.groups()]
+
+    outcome = run(tmp_path, BASE, "gateway", bridge)
+    assert outcome.code == 3, outcome
+    lost = [reason for reason in outcome.document["invalid_reasons"] if "foreign gateway" in reason]
+    assert lost, outcome
+    assert "foreign gateway, frames to the controller: lost: 185 (10)" in lost[0]
 
 
 # --- what cannot be had ----------------------------------------------------------------------------------------------

@@ -26,7 +26,7 @@ from testbench.errors import BenchError
 from testbench.fault_file import faults_of
 from testbench.gateway_process import ControlFrames, GatewayOptions, control_frames, gateway_main
 from testbench.parts import read_gateway, read_hlc, read_joints
-from testbench.process import Orders, ProcessOptions, die_with, hlc_main, joints_main, session
+from testbench.process import ENDED_EARLY, Orders, ProcessOptions, die_with, hlc_main, joints_main, session
 from testbench.scenario import Scenario, parse_scenario
 
 
