@@ -1,12 +1,14 @@
-"""Foreign software for the rig, programs of their own made of python-can and canopen alone: a master, and drives.
+"""Foreign software for the rig, programs of their own made of python-can and canopen alone: a master, drives, a gateway.
 
     foreign.py master CHANNEL CONTROL    CHANNEL of the hub, CONTROL: path of the gateway's live control
     foreign.py drives CHANNEL
+    foreign.py bridge CHANNEL CHANNEL    a gateway that loses every tenth 0x185
 
 They run until they are killed, or end with a traceback. Nothing of ours is in them but the EDS.
 """
 
 import math
+import select
 import socket
 import struct
 import sys
@@ -175,6 +177,21 @@ class Drives:
         self._bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
 
 
+def bridge(one: str, other: str) -> None:
+    """Pass on what comes in on either bus, but for every tenth answer of the right knee."""
+    buses = [can.Bus(interface="hub", channel=channel) for channel in (one, other)]
+    answers = 0
+    while True:
+        readable, _, _ = select.select(buses, [], [])
+        for bus in readable:
+            message = bus.recv(0)
+            while message is not None:
+                answers += message.arbitration_id == 0x185
+                if message.arbitration_id != 0x185 or answers % 10:
+                    buses[bus is buses[0]].send(message)
+                message = bus.recv(0)
+
+
 def start(control: str) -> None:
     """What `exo-hil fault start` does: one line of JSON to the gateway's live control, and its answer."""
     with socket.socket(socket.AF_UNIX) as link:
@@ -188,5 +205,7 @@ def start(control: str) -> None:
 if __name__ == "__main__":
     if sys.argv[1] == "master":
         CanopenMaster(sys.argv[2]).work(lambda: start(sys.argv[3]))
+    elif sys.argv[1] == "bridge":
+        bridge(sys.argv[2], sys.argv[3])
     else:
         Drives(sys.argv[2]).work()

@@ -635,6 +635,84 @@ def test_without_gateway_the_supervisors_ears_count(scenario: Scenario, expected
     assert foreign.time0_ns == hlc.time_zero  # on the grid of the plant
 
 
+def test_time_zero_of_gateway_and_controller_must_be_one(
+    scenario: Scenario, expected: RunRecord, parts: Parts
+) -> None:
+    """Faults count from the one, truth from the other: a cycle apart, every instant of an injection is wrong."""
+    hlc, gateway, joints = parts
+
+    def reasons(apart_ns: int) -> list[str]:
+        moved = replace(gateway, time_zero=hlc.time_zero + apart_ns)
+        return merge(scenario.plan, expected.duration_ns, hlc, moved, joints, []).invalid_reasons
+
+    assert reasons(0) == reasons(CYCLE - 1) == reasons(1 - CYCLE) == []
+    (late,), (early,) = reasons(CYCLE), reasons(-500 * MS)
+    assert late.startswith("the gateway's time 0, from which faults count, is 10.0 ms late of the controller's")
+    assert "500.0 ms early" in early
+    (never,) = reasons(NEVER - hlc.time_zero)
+    assert never.startswith("the gateway never learned time 0")
+
+
+@pytest.mark.parametrize(
+    ("at", "cob_id", "where"),
+    [
+        ("left", 0x186, "controller bus, frames from supervisor to controller: lost: "),
+        ("right", 0x206, "drive bus, frames from supervisor to joints: lost: "),
+        ("inside", 0x186, "foreign gateway, frames to the controller: lost: "),
+        ("inside", 0x206, "foreign gateway, frames to the drives: lost: "),
+    ],
+)
+def test_frame_lost_at_or_in_a_foreign_gateway_is_found_by_the_supervisors_ears(
+    scenario: Scenario, expected: RunRecord, parts: Parts, at: str, cob_id: int, where: str
+) -> None:
+    """It is one end of each hop; what the gateway itself loses counts in a golden run only."""
+    hlc, _, joints = parts
+    heard = [Transmission(row.end_ns, row.bus, row.frame, -1) for row in expected.rows]
+    span = range(hlc.time_zero + 700 * MS, hlc.time_zero + 800 * MS)
+    if at == "left":
+        hlc = replace(hlc, rows=without(hlc.rows, cob_id, span))
+    elif at == "right":
+        joints = replace(joints, rows=without(joints.rows, cob_id, span))
+    else:
+        out = 0 if cob_id == 0x186 else 1
+        heard = without(heard, cob_id, span, bus=out)
+        hlc = replace(hlc, rows=without(hlc.rows, cob_id, span)) if out == 0 else hlc
+        joints = replace(joints, rows=without(joints.rows, cob_id, span)) if out else joints
+    given = (scenario.plan, hlc.time_zero, hlc.cycles.size, hlc, None, joints, heard)
+
+    def is_found(golden: bool) -> bool:
+        lost = judge_timing(*given, golden=golden).lost
+        return any(one.startswith(where) and f"{cob_id:03X} (10)" in one for one in lost)
+
+    assert is_found(golden=True)
+    assert is_found(golden=False) == (at != "inside")
+
+
+def test_frames_the_supervisor_did_not_hear_count_where_nobody_else_listens(
+    scenario: Scenario, expected: RunRecord, parts: Parts
+) -> None:
+    """Without gateway its ears are the record of both buses; with one they are not used."""
+    hlc, gateway, joints = parts
+    heard = [Transmission(row.end_ns, row.bus, row.frame, -1) for row in expected.rows]
+    given = (scenario.plan, hlc.time_zero, hlc.cycles.size, hlc)
+    without_gateway = judge_timing(*given, None, joints, heard, missed=7)
+    assert without_gateway.lost == ["supervisor: 7 frames of both buses not heard, and nobody else heard them all"]
+    assert without_gateway.counted == 7
+    assert judge_timing(*given, gateway, joints, heard, missed=7).lost == []
+
+
+def test_what_is_foreign_is_said_not_to_be_judged(scenario: Scenario, parts: Parts) -> None:
+    """A run of foreign software alone proves nothing about time, and says so."""
+    hlc, gateway, joints = parts
+    given = (scenario.plan, hlc.time_zero, hlc.cycles.size)
+    assert judge_timing(*given, hlc, gateway, joints).unjudged == []
+    (no_hlc,) = judge_timing(*given, None, gateway, joints).unjudged
+    assert no_hlc.startswith("hlc: foreign: ")
+    assert judge_timing(*given, hlc, None, joints, []).unjudged == ["gateway: foreign: what it loses, delays and adds"]
+    (nothing,) = judge_timing(*given, None, None, None, []).unjudged
+    assert nothing.startswith("everything: no part of the rig is ours")
+
+
 def test_motion_that_never_began_is_told_with_its_reasons(scenario: Scenario, parts: Parts) -> None:
     """The controller's own words."""
     hlc, gateway, joints = parts

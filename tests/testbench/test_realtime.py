@@ -1,17 +1,21 @@
 """Whole runs against the clock on the hub: their result, and foreign drives. Parity is in tests/parity."""
 
 import json
+import os
+import signal
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from canopen_exo.bus.lateness import Lateness
+from canopen_exo.bus.node import MS, NEVER
+from testbench import realtime_run
 from testbench.cli import INVALID, main
-from testbench.merge import IncompleteError
-from testbench.realtime_run import RealTimeRun, run_once
+from testbench.realtime_run import RealTimeRun
 from testbench.scenario import parse_scenario
 from testbench.supervisor import Setup, Supervisor
-from tests.parity.patience import Late, Patience, distributions
+from tests.parity.patience import Late, Patience, distributions, is_lateness
 from tests.parity.walks import Bench, attempt_run, in_lock_step
 
 pytestmark = pytest.mark.realtime
@@ -33,6 +37,8 @@ def test_run_realtime_gives_the_document_of_lock_step_and_how_well_it_kept_time(
         code = main(["run", "--realtime", str(file), *shorter])
         output = capsys.readouterr()
         if code == INVALID:
+            reasons = json.loads(output.out)["invalid_reasons"] if output.out else output.err.splitlines()[-1:]
+            assert is_lateness(reasons, HUB.cycle_ns / 1e6), (reasons, output.err)
             return Late(why_invalid(output.out) or output.err.strip())
         assert code == 0, output.err
         return output.out
@@ -67,20 +73,42 @@ def why_invalid(document: str) -> str:
     return f"{', '.join(result['invalid_reasons'])}; {distributions(late)}"
 
 
-def test_limits_that_nothing_can_keep_make_a_run_invalid(patience: Patience) -> None:
-    """The limits stand in the scenario: with none allowed, one late cycle is one too many."""
-    limits = "realtime={late_share: 0, late_worst: 0 s}"
-    scenario = parse_scenario(HUB.text(), overrides=["motion.duration=0.5s", limits])
+@pytest.mark.parametrize("name", ["joints", "gateway"])
+def test_process_that_is_held_up_for_some_cycles_makes_a_run_invalid(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Exit 3, and the reason is lateness: one late cycle is one too many where the scenario allows none."""
+    file = tmp_path / "scenario.yaml"
+    file.write_text(HUB.text() + "realtime: {late_share: 0, late_worst: 0 s}\n")
+    rigs: list[Supervisor] = []
+    held: list[int] = []
 
-    def attempt() -> RealTimeRun | Late:
-        try:
-            return run_once(Setup(scenario, faults=False, keep_parts=True))
-        except IncompleteError as error:
-            return Late(str(error))
+    def hold_up(now: int) -> None:
+        """In the golden run from 50 ms after time 0: stopped, and let go at the first look 30 ms later."""
+        rig = rigs[0]
+        zero = rig.watch.time_zero
+        if not held and zero < NEVER and now > zero + 50 * MS:
+            os.kill(rig.processes[name].pid, signal.SIGSTOP)
+            held.append(now)
+        elif len(held) == 1 and now >= held[0] + 30 * MS:
+            os.kill(rig.processes[name].pid, signal.SIGCONT)
+            held.append(now)
 
-    run = patience.until_punctual(attempt)
-    assert run.record.valid == (not run.timing.late and run.record.completed and not run.timing.lost)
-    assert not run.timing.lost or run.timing.counted
+    def supervised(setup: Setup, **given: Any) -> Supervisor:
+        rigs.append(Supervisor(setup, tick=hold_up if not rigs else lambda now: None, **given))
+        return rigs[-1]
+
+    monkeypatch.setattr(realtime_run, "Supervisor", supervised)
+    out = ["--set", "motion.duration=0.5s", "--json", "--out", str(tmp_path / "result")]
+    assert main(["run", "--realtime", str(file), *out]) == INVALID
+    assert len(held) == 2
+    output = capsys.readouterr()
+    if output.out:  # else the drives have given up for want of SYNC, before the motion was as long as the plant's
+        document = json.loads(output.out)
+        assert document["realtime"]["golden"]["late_cycles"] > 0
+        assert any(reason.startswith("golden run: ") and " late " in reason for reason in document["invalid_reasons"])
+    else:
+        assert "wake-ups served late" in output.err
 
 
 # --- foreign drives --------------------------------------------------------------------------------------------------

@@ -19,10 +19,10 @@ import pytest
 from canopen_exo.bus.node import SECOND
 from canopen_exo.cia402 import DriveState
 from testbench import supervisor
-from testbench.child import ProcessError
+from testbench.child import Process, ProcessError
 from testbench.cli import INVALID
 from testbench.errors import BenchError
-from testbench.process import LEAVE_NS
+from testbench.process import DONE, ENDED_EARLY, LEAVE_NS
 from testbench.scenario import JOINT_NAMES, Scenario
 from testbench.supervisor import Setup, Supervisor
 from tests.parity.patience import Late, Patience
@@ -154,6 +154,34 @@ def test_killed_process_is_named_and_the_others_react_and_end(name: str, patienc
 
 
 # --- not started -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("code", "is_crash"), [(DONE, False), (ENDED_EARLY, False), (1, True), (2, True), (3, True)])
+def test_controller_that_crashes_is_not_one_that_gave_up(
+    scenario: Scenario, monkeypatch: pytest.MonkeyPatch, code: int, is_crash: bool
+) -> None:
+    """1 is what the interpreter itself ends with, 2 and 3 what our programs say of files and runs."""
+    monkeypatch.setattr(Supervisor, "_start_joints", lambda self: None)
+    monkeypatch.setattr(Supervisor, "_start_gateway", lambda self: None)
+    program = f"import sys; sys.exit({code})"
+    ended = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+    ended.wait()
+
+    def start(rig: Supervisor) -> None:
+        process = Process("hlc", ["--help"], lambda line: None)
+        process.wait(60.0)
+        process.close()
+        monkeypatch.setattr(process, "_running", ended)
+        rig.processes["hlc"] = process
+
+    monkeypatch.setattr(Supervisor, "_start_hlc", start)
+    with Supervisor(Setup(scenario)) as rig:
+        rig.start()
+        if is_crash:
+            with pytest.raises(ProcessError, match=f"hlc ended with exit code {code}"):
+                rig.run(lambda now: True)
+        else:
+            rig.run(lambda now: rig.processes["hlc"].code is not None)
 
 
 def test_part_that_is_never_heard_is_named(scenario: Scenario, monkeypatch: pytest.MonkeyPatch) -> None:
