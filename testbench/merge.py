@@ -96,9 +96,7 @@ def _zeros_apart(plan: BusPlan, hlc: HlcPart | None, gateway: GatewayPart | None
     ]
 
 
-def time_zero_of(
-    plan: BusPlan, hlc: HlcPart | None, gateway: GatewayPart | None, heard: list[Transmission]
-) -> int:
+def time_zero_of(plan: BusPlan, hlc: HlcPart | None, gateway: GatewayPart | None, heard: list[Transmission]) -> int:
     """Time 0 [ns]: the controller's own; of a foreign one the gateway's or the bus's, on the 1 ms grid of the plant."""
     if hlc is not None:
         if hlc.time_zero == NEVER or hlc.cycles.size == 0:

@@ -130,7 +130,9 @@ def differences(found: dict[Key, Pairing]) -> str:
     """What was lost, doubled or out of order, by id in words; "" for nothing."""
     lost = [f"{key[0]:03X} ({len(one.missing)})" for key, one in found.items() if one.missing]
     extra = [f"{key[0]:03X} ({len(one.extra)})" for key, one in found.items() if one.extra]
-    texts = [f"{what}: {_listed(which)}" for what, which in (("lost", lost), ("doubled or out of order", extra)) if which]
+    texts = [
+        f"{what}: {_listed(which)}" for what, which in (("lost", lost), ("doubled or out of order", extra)) if which
+    ]
     return "; ".join(texts)
 
 

@@ -65,9 +65,7 @@ def run_realtime(
     check_expectations(scenario, without)
     started = time.perf_counter()
     listen, control = places
-    setup = Setup(
-        scenario, buses, without, faults=False, keep_parts=True, fifo=fifo, listen=listen, control=control
-    )
+    setup = Setup(scenario, buses, without, faults=False, keep_parts=True, fifo=fifo, listen=listen, control=control)
     if without and buses is None:  # one hub for both runs, so that foreign software stays on its buses
         with Supervisor(setup) as host:
             host.start_hub()

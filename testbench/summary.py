@@ -124,8 +124,8 @@ class EventEntry(TypedDict):
 
 
 class RealTimeRunEntry(TypedDict):
-    """One real-time run. not_judged: what is foreign, in words; lateness: of wake-ups, by process; latency: added by the
-    gateway, by the bus it sent on.
+    """One real-time run. not_judged: what is foreign, in words; lateness: of wake-ups, by process; latency: added by
+    the gateway, by the bus it sent on.
     """
 
     cycles: int

@@ -26,7 +26,12 @@ _TIMING: Final = re.compile(
     r"timing: (\d+) of (\d+) cycles late, SYNC off by at most ([\d.]+) ms; (\d+) frames not heard"
 )
 
-_LATE: Final = ("cycles late (", "a cycle late by ", "the motion was given up without a fault", "the controller's deadline")
+_LATE: Final = (
+    "cycles late (",
+    "a cycle late by ",
+    "the motion was given up without a fault",
+    "the controller's deadline",
+)
 """In the reasons of an invalid run: what a machine that is too busy does to it."""
 
 _LATEST: Final = re.compile(r"the latest ([\d.]+) ms")

@@ -1,4 +1,4 @@
-"""Foreign software for the rig, programs of their own made of python-can and canopen alone: a master, drives, a gateway.
+"""Foreign software for the rig, programs of their own made of python-can and canopen alone: master, drives, gateway.
 
     foreign.py master CHANNEL CONTROL    CHANNEL of the hub, CONTROL: path of the gateway's live control
     foreign.py drives CHANNEL

@@ -228,10 +228,7 @@ def without(
     return [
         row
         for row in rows
-        if row.frame.can_id != cob_id
-        or (row.sender >= 0) != own
-        or row.end_ns not in span
-        or bus not in (-1, row.bus)
+        if row.frame.can_id != cob_id or (row.sender >= 0) != own or row.end_ns not in span or bus not in (-1, row.bus)
     ]
 
 
@@ -334,9 +331,7 @@ def test_frame_that_waits_in_the_gateway_is_late_from_when_it_came(scenario: Sce
 
 
 @pytest.mark.parametrize("who", ["controller", "joints"])
-def test_answer_or_command_that_was_never_sent_makes_its_cycle_late(
-    scenario: Scenario, parts: Parts, who: str
-) -> None:
+def test_answer_or_command_that_was_never_sent_makes_its_cycle_late(scenario: Scenario, parts: Parts, who: str) -> None:
     """Nothing was lost, and nothing that was sent was late: it is just not there."""
     hlc, gateway, joints = parts
     span = range(hlc.time_zero + 70 * CYCLE, hlc.time_zero + 73 * CYCLE)
@@ -358,7 +353,7 @@ def test_answer_or_command_that_was_never_sent_makes_its_cycle_late(
 
 def test_drives_owe_no_answer_to_a_sync_that_a_fault_took(scenario: Scenario, parts: Parts) -> None:
     """They answer what they get; and one that reported an error owes nothing until it answers again."""
-    hlc, gateway, joints = parts
+    hlc, _, joints = parts
     span = range(hlc.time_zero + 70 * CYCLE, hlc.time_zero + 80 * CYCLE)
     rows = [row for row in joints.rows if row.end_ns not in span]
     assert judged(scenario, hlc, None, replace(joints, rows=rows)).late == {}
@@ -411,9 +406,7 @@ def test_commands_late_by_more_than_the_cycle_has_left_make_it_late(
 
 
 @pytest.mark.parametrize("who", ["controller", "joints", "gateway"])
-def test_process_that_stands_still_for_three_cycles_makes_them_late(
-    scenario: Scenario, parts: Parts, who: str
-) -> None:
+def test_process_that_stands_still_for_three_cycles_makes_them_late(scenario: Scenario, parts: Parts, who: str) -> None:
     """Whoever stands still: what it sends in that time goes out at its end, 30 ms late at most."""
     hlc, gateway, joints = parts
     start = hlc.time_zero + 40 * CYCLE
@@ -432,9 +425,7 @@ def test_process_that_stands_still_for_three_cycles_makes_them_late(
     timing = judged(
         scenario,
         replace(hlc, rows=stopped(hlc.rows, {(0, True): 0, (0, False): 7})),
-        replace(
-            gateway, rows=stopped(gateway.rows, {(0, False): 1, (1, True): 2, (1, False): 5, (0, True): 6})
-        ),
+        replace(gateway, rows=stopped(gateway.rows, {(0, False): 1, (1, True): 2, (1, False): 5, (0, True): 6})),
         replace(joints, rows=stopped(joints.rows, {(0, False): 3, (0, True): 4})),
     )
     assert set(timing.late) >= {40, 41}
@@ -635,9 +626,7 @@ def test_without_gateway_the_supervisors_ears_count(scenario: Scenario, expected
     assert foreign.time0_ns == hlc.time_zero  # on the grid of the plant
 
 
-def test_time_zero_of_gateway_and_controller_must_be_one(
-    scenario: Scenario, expected: RunRecord, parts: Parts
-) -> None:
+def test_time_zero_of_gateway_and_controller_must_be_one(scenario: Scenario, expected: RunRecord, parts: Parts) -> None:
     """Faults count from the one, truth from the other: a cycle apart, every instant of an injection is wrong."""
     hlc, gateway, joints = parts
 

@@ -97,9 +97,7 @@ linux = pytest.mark.skipif(sys.platform != "linux", reason="looks at /proc, and 
 @pytest.mark.parametrize(
     ("number", "code"), [(signal.SIGINT, 0), (signal.SIGTERM, 0), (signal.SIGKILL, -signal.SIGKILL)]
 )
-def test_up_ends_with_all_its_processes(
-    tmp_path: Path, number: signal.Signals, code: int, patience: Patience
-) -> None:
+def test_up_ends_with_all_its_processes(tmp_path: Path, number: signal.Signals, code: int, patience: Patience) -> None:
     """Ctrl-C and SIGTERM are the normal end of `up`; and when it is killed itself, its processes end all the same."""
     (tmp_path / "rig.yaml").write_text(TEXT)
     assert patience.until_punctual(lambda: attempt_up(tmp_path, number)) == code
