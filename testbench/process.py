@@ -140,7 +140,7 @@ class Session:
         found: dict[str, int] = {}
         for channel, lost in zip(self._channels, self.loop.losses_by_channel(), strict=True):
             for count, what in (
-                (lost.queue_full, f"dropped, the transmit queue for {channel.name} was full"),
+                (lost.queue_full, f"dropped for {channel.name}, the transmit queue was full"),
                 (lost.discarded, f"discarded, {channel.name} was off"),
                 (lost.overruns, f"dropped by {channel.name} before they were read"),
                 (lost.not_taken, f"not taken by {channel.name}"),
