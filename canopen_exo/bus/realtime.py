@@ -313,11 +313,10 @@ class RealTimeLoop:
         line.state = state.state
         _LOG.log(
             logging.WARNING if changed else logging.DEBUG,
-            "%s: %s (TEC %d, REC %d): %s",
+            "%s: %s%s: %s",
             line.channel.name,
             state.state.value.replace("_", " "),
-            state.tec,
-            state.rec,
+            f" (TEC {state.tec}, REC {state.rec})" if state.tec or state.rec else "",
             state.cause,
         )
         for port in line.ports:
