@@ -172,7 +172,7 @@ def test_end_of_the_motion_is_told_with_its_cause_and_lateness() -> None:
     assert watch.timing_words() == ""
     cycle(watch, 7 * PLAN.cycle_ns, answers=5)
     cycle(watch, 8 * PLAN.cycle_ns)
-    late = f"the rig was late: 1 of 6 cycles, SYNC off by at most {2 * PLAN.cycle_ns / 1e6:.1f} ms; "
+    late = f"the rig was late: 1 of 5 cycles, SYNC off by at most {2 * PLAN.cycle_ns / 1e6:.1f} ms; "
     assert watch.timing_words().startswith(late + "this machine is too busy for ")
     for node_id, code in ((2, 0x8700), (1, 0x8250)):
         watch.receive(0, DRIVE_PORT, Frame(0x80 + node_id, code.to_bytes(2, "little") + bytes(6)), Sent())
