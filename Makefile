@@ -57,8 +57,11 @@ demo: $(READY) ## a frozen knee encoder, with its verdict (pass and fail are bot
 	$(BIN)/python -c 'import json; print("verdict:", json.load(open("results/demo/summary.json"))["verdict"])' && \
 	echo "traces and plots: results/demo"
 
-test: lint unit runs realtime vcan compile ## all of the next six; says last how many tests were skipped, and why
-	@$(BIN)/python -m tests.summary $(foreach part,unit runs realtime vcan,$(REPORTS)/$(part).xml)
+test: $(READY) ## all of the next six, whatever fails on the way; says last what failed, how many were skipped, and why
+	@rm -rf $(REPORTS); failed=; \
+	for part in lint unit runs realtime vcan compile; do \
+	  $(MAKE) --no-print-directory $$part || failed="$$failed $$part"; done; \
+	$(BIN)/python -m tests.summary --failed "$$failed" $(foreach part,unit runs realtime vcan,$(REPORTS)/$(part).xml)
 
 lint: $(READY) ## ruff, mypy --strict, import contracts
 	$(BIN)/python -m ruff check .

@@ -29,6 +29,21 @@ HEARTBEAT_LOST: Final = 0x8130
 SYNC_LOST: Final = 0x8700
 """CiA 402-2: sync controller, loss of the synchronisation in a cyclic synchronous mode."""
 
+_WORDS: Final = {
+    SYNC_LENGTH: "SYNC of unexpected length",
+    PDO_TOO_SHORT: "PDO too short, not processed",
+    PDO_TOO_LONG: "PDO longer than its mapping",
+    RPDO_TIMEOUT: "RPDO time-out",
+    HEARTBEAT_LOST: "heartbeat lost",
+    SYNC_LOST: "SYNC lost",
+}
+
+
+def error_words(code: int) -> str:
+    """An error code for people: "SYNC lost (8700)"; for one that is not of this module the code alone."""
+    return f"{_WORDS[code]} ({code:04X})" if code in _WORDS else f"error {code:04X}"
+
+
 GENERIC_BIT: Final = 0x01
 COMMUNICATION_BIT: Final = 0x10
 

@@ -126,7 +126,8 @@ class LiveControl:
         """Time 0 is now, for a rig whose master does not say it on the bus. Refused when it is known already."""
         zero = self.gateway.time_zero
         if zero != NEVER:
-            why = f"time 0 is known already, since {(now - zero) / 1e9:.3f} s, and does not move; restart the gateway"
+            ago_s = (now - zero) / 1e9
+            why = f"time 0 is known already, it was {ago_s:.3f} s ago, and does not move; restart the gateway"
             raise self._refused(now, START, "", source, why)
         self.gateway.settle(now - 1)
         self.gateway.begin(now)
@@ -191,6 +192,9 @@ class LiveControl:
         if injector.phase is INERT and injector.enabled:
             what = "the first frame" if injector.from_power_up else "time 0: the controller's status frame, or start"
             return f"it waits for {what}"
+        if injector.phase is SPENT and injector.enabled:
+            over = "the motion" if injector.activated == 0 else "its last window, or the motion,"
+            return f"it is spent, {over} is over; arm it to let it act all the same"
         return f"it is {self._state(injector)}; arm it first"
 
     def _find(self, name: str, what: str, now: int, source: str) -> Injector:
@@ -314,7 +318,7 @@ def statistics_text(directions: list[Direction]) -> str:
             if count:
                 parts.append(f"{count} {what}")
         if one.notices:
-            parts.append(f"{one.notices} error notices")
+            parts.append("1 error notice" if one.notices == 1 else f"{one.notices} error notices")
         late = one.latency
         if late is not None and late.count:
             median, most, worst = late.percentile(0.5) / 1e3, late.percentile(0.99) / 1e3, late.worst_ns / 1e3
@@ -347,8 +351,9 @@ def latency_text(directions: list[Direction]) -> str:
 
 
 def _edge_text(edge_ns: int) -> str:
-    """An edge of the histogram, in two or three digits."""
-    return f"{edge_ns / 1e3:.2g} us" if edge_ns < 100_000 else f"{edge_ns / 1e6:.2g} ms"
+    """An edge of the histogram, in two digits; never as a power of ten."""
+    value, unit = (edge_ns / 1e3, "us") if edge_ns < 100_000 else (edge_ns / 1e6, "ms")
+    return f"{float(f'{value:.2g}'):g} {unit}"
 
 
 def listing_text(rows: list[InjectorRow], now: int) -> str:
@@ -357,6 +362,16 @@ def listing_text(rows: list[InjectorRow], now: int) -> str:
     lines = []
     for row in rows:
         counts = f"{row.activated} activations, {row.injected} frames acted on, {row.manifested} changed"
-        due = "" if row.next_ns >= NEVER else f"; next in {(row.next_ns - now) / 1e9:.3f} s"
-        lines.append(f"{row.name:{width}}  {row.state:8}  {counts}{due}")
+        lines.append(f"{row.name:{width}}  {row.state:8}  {counts}{_next_text(row, now)}")
     return "\n".join(lines) or "no injectors"
+
+
+def _next_text(row: InjectorRow, now: int) -> str:
+    """When it acts next, or why it does not, where the state alone does not say it."""
+    if row.next_ns < NEVER:
+        return f"; next in {(row.next_ns - now) / 1e9:.3f} s"
+    if row.state == ARMED.value:
+        return "; no event to come, only a trigger or `exo-hil fault trigger` starts it"
+    if row.state == SPENT.value and row.activated == 0:
+        return "; the motion was over before it acted"
+    return ""

@@ -211,9 +211,10 @@ def _real_time_buses(options: argparse.Namespace) -> tuple[str, str] | None:
     from testbench.errors import BenchError
 
     buses = named_buses(options)
-    if not options.realtime and (buses or options.without or options.fifo or options.listen or options.control):
-        real_time = "--controller-bus, --drive-bus, --without, --listen, --control and --fifo"
-        raise BenchError(f"{real_time} are of real time; add --realtime")
+    of_real_time = ("controller_bus", "drive_bus", "without", "listen", "control", "fifo")
+    given = [f"--{name.replace('_', '-')}" for name in of_real_time if getattr(options, name)]
+    if given and not options.realtime:
+        raise BenchError(f"{', '.join(given)}: {'is' if len(given) == 1 else 'are'} of real time; add --realtime")
     return buses
 
 

@@ -18,7 +18,19 @@ from typing import TYPE_CHECKING, Final
 
 from canopen_exo.bus.interfaces import BusName, bus_identity
 from fi_gateway.bus_control import DEFAULT_COMMAND_ID, DEFAULT_STATUS_ID, BusControl
-from fi_gateway.control import LiveControl, changes_text, latency_text, statistics, statistics_text
+from fi_gateway.control import (
+    ARM,
+    DISARM,
+    RESUME,
+    START,
+    STOP,
+    TRIGGER,
+    LiveControl,
+    changes_text,
+    latency_text,
+    statistics,
+    statistics_text,
+)
 from fi_gateway.control_socket import ControlServer
 from fi_gateway.errors import FaultError
 from fi_gateway.gateway import CONTROLLER_PORT, DRIVE_PORT, Gateway
@@ -27,6 +39,17 @@ from testbench.process import DONE, ProcessOptions, Session, say, session
 
 if TYPE_CHECKING:
     from testbench.fault_file import FaultFile
+
+_DONE: Final = {
+    ARM: "{name}: armed",
+    DISARM: "{name}: disarmed",
+    TRIGGER: "{name}: triggered",
+    START: "time 0 is now",
+    STOP: "injection is stopped, every frame passes; `exo-hil fault resume` resumes",
+    RESUME: "injection goes on",
+}
+_IGNORED: Final = "{name}: not triggered, it is active, or waits for a value, already"
+"""What `exo-hil fault` says when it has asked."""
 
 SIDES: Final = {"controller": CONTROLLER_PORT, "drive": DRIVE_PORT}
 
@@ -141,7 +164,8 @@ def fault_main(word: str, name: str, address: str) -> int:
     from fi_gateway.control_socket import ask, ask_listing
 
     if word in WORDS:
-        ask(address, word, name)
+        done = ask(address, word, name).get("done") is True
+        sys.stdout.write((_DONE[word] if done else _IGNORED).format(name=name) + "\n")
     else:
         sys.stdout.write(ask_listing(address).text() + "\n")
     return DONE

@@ -3,6 +3,7 @@
 import sys
 from typing import Final
 
+from testbench.child import ProcessError
 from testbench.gateway_process import active_faults
 from testbench.status import StatusLine
 from testbench.supervisor import Setup, Supervisor
@@ -14,10 +15,13 @@ def run_up(setup: Setup) -> int:
     """Start the rig and keep it until Ctrl-C or SIGTERM, which is its normal end (0). Raises BenchError."""
     line: StatusLine | None = None
 
+    is_over = False
+
     def say(text: str) -> None:
         if line is not None:
             line.clear()
-        print(text, file=sys.stderr, flush=True)
+        if not is_over:
+            print(text, file=sys.stderr, flush=True)
 
     def show(now: int) -> None:
         if line is not None:
@@ -33,7 +37,11 @@ def run_up(setup: Setup) -> int:
                 say(f"live control: exo-hil fault list --at {address}")
             say("running; Ctrl-C stops")
             line = StatusLine(rig.watch, sys.stderr, lambda: active_faults(address) if address else [])
-            rig.run(lambda now: False)
+            try:
+                rig.run(lambda now: False)
+            except ProcessError:
+                is_over = True  # who died and why comes last, and not before pages of statistics
+                raise
     except KeyboardInterrupt:
         if line is not None:
             line.clear()

@@ -367,8 +367,9 @@ def _violations(found: Sequence[Violation]) -> list[ViolationEntry]:
 def summary_text(document: Summary) -> str:
     """The document for people: at most MOST_LINES lines of plain text for six joints, columns aligned."""
     load = ", ".join(f"{name} bus {100 * bus['load']:.0f} %" for name, bus in document["bus"].items())
+    heading = document["verdict"].upper() if document["valid"] else "INVALID"
     head = [
-        f"{document['verdict'].upper()}  {document['scenario']}, seed {document['seed']}: {_outcome_text(document)}",
+        f"{heading}  {document['scenario']}, seed {document['seed']}: {_outcome_text(document)}",
         f"      {document['sim_time_s']:.1f} s simulated in {document['wall_time_s']:.2f} s "
         f"({document['x_realtime']:.1f} x real time); {load}",
         *_real_time_lines(document),

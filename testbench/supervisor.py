@@ -23,12 +23,13 @@ from canopen_exo.bus.channel import Channel
 from canopen_exo.bus.medium import Transmission
 from canopen_exo.bus.node import MS, NEVER, SECOND
 from canopen_exo.bus.realtime import RealTimeLoop
+from canopen_exo.emcy import error_words
 from fi_gateway.control_socket import is_path, remove_left
 from testbench.child import Process, ProcessError
 from testbench.errors import BenchError
 from testbench.process import DONE, ENDED_EARLY, Orders, open_bus
 from testbench.scenario import Scenario
-from testbench.watch import CONTROLLER_PORT, DRIVE_PORT, Watch
+from testbench.watch import CONTROLLER_PORT, DRIVE_PORT, Watch, alarms_text
 
 PARTS: Final = ("joints", "gateway", "hlc")
 """In the order in which they are started; any of them may be foreign software instead."""
@@ -109,6 +110,8 @@ class Supervisor:
         self._loop: RealTimeLoop | None = None
         self._hub_address: str = ""
         self._look_at: int = 0
+        self._told: int = 0
+        self._known: Final[set[tuple[str, int]]] = set()
         self._is_started: bool = False
 
     def __enter__(self) -> "Supervisor":
@@ -319,6 +322,7 @@ class Supervisor:
             if now >= self._look_at:
                 self._look_at = now + _LOOK_NS
                 self._tick(now)
+                self._tell_alarms()
                 for process in (*self.processes.values(), *self._borrowed):
                     if self._is_dead(process):
                         dead = process
@@ -331,6 +335,15 @@ class Supervisor:
         if dead is None:
             self._check_orders()
         return dead
+
+    def _tell_alarms(self) -> None:
+        """Say what drives report to a foreign controller, each error of a drive once: ours says it itself."""
+        alarms = self.watch.alarms
+        for alarm in alarms[self._told :] if "hlc" in self.setup.without else ():
+            if alarm.code and (alarm.joint, alarm.code) not in self._known:
+                self._known.add((alarm.joint, alarm.code))
+                self._announce(f"{alarm.joint}: {error_words(alarm.code)}")
+        self._told = len(alarms)
 
     def _is_dead(self, process: Process) -> bool:
         """Whether it ended unasked; the controller may when its one motion is over."""
@@ -355,9 +368,13 @@ class Supervisor:
             process.is_told = True
         self._listen(lambda now: now >= died_at + REACT_NS or all(process.code is not None for process in others))
         text = dead.obituary()
-        if len(self.watch.alarms) > alarms:
-            told = {f"{alarm.joint} {alarm.code:04X}" for alarm in self.watch.alarms[alarms:] if alarm.code}
-            text += f"\nthe drives then reported: {', '.join(sorted(told))}"
+        told = alarms_text(self.watch.alarms[alarms:])
+        if told:
+            text += f"\nthe drives then reported: {told}"
+        if dead.name == "hlc":  # the death of another one makes cycles late by itself
+            ended_by, timing = self.watch.ended_by, self.watch.timing_words()
+            text += f"\nthe motion ended because {ended_by}" if ended_by else ""
+            text += f"\n{timing}" if timing else ""
         if dead.code == REFUSED and not self._is_started:
             raise BenchError(text)
         raise ProcessError(text)

@@ -13,6 +13,7 @@ from canopen_exo import plan as ids
 from canopen_exo.bus.frame import Frame
 from canopen_exo.bus.node import MS, NEVER, ErrorState, Node, Out, PortState
 from canopen_exo.cia402 import DriveState, decode_statusword
+from canopen_exo.emcy import HEARTBEAT_LOST, RPDO_TIMEOUT, SYNC_LOST, error_words
 from canopen_exo.plan import BusPlan
 
 CONTROLLER_PORT: Final = 0
@@ -22,6 +23,10 @@ ASK_EVERY_NS: Final = 100 * MS
 
 _DEVICE_TYPE: Final = bytes((0x40, 0x00, 0x10, 0x00, 0, 0, 0, 0))
 """SDO initiate upload of 0x1000:00 (CiA 301, 7.2.4.3.5)."""
+
+
+_DROPS_TORQUE: Final = (HEARTBEAT_LOST, RPDO_TIMEOUT, SYNC_LOST)
+"""Errors with which a drive drops its torque (its 0x6007)."""
 
 
 @final
@@ -43,6 +48,7 @@ class Watch(Node):
     heard: by port, the drives heard there since the last `ask`; master_heard: the controller's boot-up or SYNC came;
     states: of the drives, by TPDO2, None before the first; alarms: every EMCY, in order; time_zero: loop clock, from
     the controller's status frame, NEVER before it; motion: last state in that frame; phase: of the stride, 0..1.
+    ended_by: the error after which the controller ended the motion, in words, "" for none.
     cycles, late: SYNCs on the controller bus since answers and commands were first complete, and those before whose
     successor they were not; worst_ns: largest difference between a SYNC's distance to the one before and the cycle.
     ports: state of both interfaces; bits: by port, carried so far.
@@ -57,6 +63,7 @@ class Watch(Node):
         self.alarms: Final[list[Alarm]] = []
         self.time_zero: int = NEVER
         self.motion: int = 0
+        self.ended_by: str = ""
         self.phase: float = 0.0
         self.cycles: int = 0
         self.late: int = 0
@@ -97,6 +104,16 @@ class Watch(Node):
             if name in missing:
                 out.send(port, Frame(ids.SDO_REQUEST + node_id, _DEVICE_TYPE))
         self.wake_at = now + ASK_EVERY_NS
+
+    def timing_words(self) -> str:
+        """What was late, for people; "" for a rig that kept time: no late cycle, no SYNC off by half a cycle."""
+        if not self.late and self.worst_ns <= self.plan.cycle_ns // 2:
+            return ""
+        rate_hz = 1e9 / self.plan.cycle_ns
+        return (
+            f"the rig was late: {self.late} of {self.cycles} cycles, SYNC off by at most {self.worst_ns / 1e6:.1f} ms; "
+            f"this machine is too busy for {rate_hz:g} Hz: end what else runs on it, lower rig.rate, or try --fifo"
+        )
 
     # --- listening -----------------------------------------------------------------------------------------------
 
@@ -163,6 +180,9 @@ class Watch(Node):
     def _status(self, data: bytes) -> None:
         if len(data) < 5:
             return
+        if data[0] == ids.STATUS_STOPPED != self.motion:
+            dropped = [alarm for alarm in self.alarms if alarm.code in _DROPS_TORQUE]
+            self.ended_by = f"{dropped[0].joint} dropped its torque: {error_words(dropped[0].code)}" if dropped else ""
         self.motion = data[0]
         if data[0] == ids.STATUS_MOTION:
             if self.time_zero == NEVER:
@@ -170,6 +190,16 @@ class Watch(Node):
         elif data[0] == ids.STATUS_STOPPED:
             self._complete = False
         self.phase = (data[3] | data[4] << 8) / 65536
+
+
+def alarms_text(alarms: Iterable[Alarm]) -> str:
+    """Errors in words, with the drives that told them: "SYNC lost (8700): left_hip, left_knee"; "" for none."""
+    found: dict[int, list[str]] = {}
+    for alarm in alarms:
+        joints = found.setdefault(alarm.code, [])
+        if alarm.joint not in joints:
+            joints.append(alarm.joint)
+    return "; ".join(f"{error_words(code)}: {', '.join(joints)}" for code, joints in sorted(found.items()) if code)
 
 
 def states_text(states: Iterable[DriveState | None]) -> str:

@@ -2,7 +2,9 @@
 
 import pytest
 
-from tests.parity.patience import Patience
+pytest.register_assert_rewrite("tests.parity.parity", "tests.parity.rigs", "tests.parity.walks")  # say what was found
+
+from tests.parity.patience import Patience  # noqa: E402 - what it imports is rewritten as well
 
 
 @pytest.fixture(scope="session")

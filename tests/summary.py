@@ -1,13 +1,16 @@
 """The last lines of `make test`: how many tests passed, how many were skipped, and why.
 
-    python -m tests.summary build/reports/unit.xml ...
+    python -m tests.summary --failed "lint vcan" build/reports/unit.xml ...
 
-Reads the JUnit files that the recipes have pytest write; exit 1 when one is missing or tells of a failure.
+Reads the JUnit files that the recipes have pytest write; exit 1 when one is missing or tells of a failure, and when a
+recipe failed.
 """
 
+import argparse
 import sys
 import xml.etree.ElementTree as ET
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
@@ -18,11 +21,14 @@ WIDTH: Final = 240
 """Characters of a reason; the recipe that ran the test has printed all of it."""
 
 
-def summarise(reports: list[Path], no_compiled_build: str | None) -> tuple[list[str], bool]:
-    """The lines, and whether all went well. no_compiled_build: why there is none, None when there is."""
+def summarise(reports: list[Path], no_compiled_build: str | None, failed: Sequence[str] = ()) -> tuple[list[str], bool]:
+    """The lines, and whether all went well.
+
+    no_compiled_build: why there is none, None when there is; failed: the recipes that did.
+    """
     passed = 0
     reasons: Counter[str] = Counter()
-    problems: list[str] = []
+    problems = [f"make {recipe} failed" for recipe in failed]
     for report in reports:
         try:
             cases = list(ET.parse(report).iter("testcase"))
@@ -49,7 +55,11 @@ def summarise(reports: list[Path], no_compiled_build: str | None) -> tuple[list[
 
 def main() -> int:
     """Print it."""
-    lines, is_well = summarise([Path(argument) for argument in sys.argv[1:]], no_compiler())
+    parser = argparse.ArgumentParser(description="the last lines of `make test`")
+    parser.add_argument("--failed", default="", metavar="RECIPES", help="those that failed, with spaces between them")
+    parser.add_argument("reports", nargs="+", type=Path, help="JUnit files")
+    given = parser.parse_args()
+    lines, is_well = summarise(given.reports, no_compiler(), given.failed.split())
     print("\n".join(lines))
     return 0 if is_well else 1
 

@@ -11,6 +11,8 @@ from tests.summary import WIDTH, summarise
 
 ROOT = Path(__file__).resolve().parent.parent
 
+PARTS = ("lint", "unit", "runs", "realtime", "vcan", "compile")
+
 TESTS = f'''
 import pytest
 
@@ -56,3 +58,24 @@ def test_part_that_failed_or_left_no_report_is_no_success(tmp_path: Path, conten
     lines, is_well = summarise([path], None)
     assert not is_well
     assert str(path) in lines[-1]
+
+
+def test_recipe_that_failed_is_told_and_no_success(report: Path) -> None:
+    """Also one that leaves no report, such as lint; the counts are there all the same."""
+    lines, is_well = summarise([report], None, ["lint", "compile"])
+    assert not is_well
+    assert lines[0].startswith("make test: 1 passed, 4 skipped")
+    assert lines[-2:] == ["make lint failed", "make compile failed"]
+
+
+def test_recipes_go_on_after_one_that_failed(tmp_path: Path) -> None:
+    """`make test` runs all of them whatever fails, and fails in the end."""
+    rule = (ROOT / "Makefile").read_text().split("\ntest: ")[1].split("\n\n")[0].replace("$(READY)", "")
+    recipes = "\n".join(f"{one}:\n\t@echo ran $@; {'false' if one == 'unit' else 'true'}" for one in PARTS)
+    (tmp_path / "Makefile").write_text(f"BIN := .\nREPORTS := reports\ntest: {rule}\n{recipes}\n")
+    (tmp_path / "python").write_text('#!/bin/sh\necho "$@"\ncase "$4" in "") exit 0;; *) exit 1;; esac\n')
+    (tmp_path / "python").chmod(0o755)
+    ended = subprocess.run(["make", "test"], cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert [line for line in ended.stdout.splitlines() if line.startswith("ran ")] == [f"ran {one}" for one in PARTS]
+    assert ended.returncode != 0
+    assert "--failed  unit reports/unit.xml" in ended.stdout

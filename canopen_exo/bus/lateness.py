@@ -66,6 +66,8 @@ class Lateness:
 
     def words(self) -> str:
         """For people, in ms."""
+        if not self.count:
+            return "none"
         shares = ", ".join(f"{share} % within {self.percentile(share / 100) / 1e6:.1f} ms" for share in (50, 90, 99))
         return f"{self.count}, {shares}, the latest {self.worst_ns / 1e6:.1f} ms"
 

@@ -330,11 +330,10 @@ class RealTimeLoop:
         line.note(state.state)
         _LOG.log(
             logging.WARNING if changed else logging.DEBUG,
-            "%s: %s (TEC %d, REC %d) at %.3f s: %s",
+            "%s: %s%s at %.3f s: %s",
             line.channel.name,
             state.state.value.replace("_", " "),
-            state.tec,
-            state.rec,
+            f" (TEC {state.tec}, REC {state.rec})" if state.tec or state.rec else "",
             now / SECOND,
             state.cause,
         )

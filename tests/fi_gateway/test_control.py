@@ -15,6 +15,7 @@ from canopen_exo.bus.frame import FLAG_EXTENDED, FLAG_FD, FLAG_REMOTE, Frame
 from canopen_exo.bus.lateness import Lateness
 from canopen_exo.bus.losses import Losses
 from canopen_exo.bus.node import MS, NEVER, SECOND, ErrorState, Out, PortState
+from canopen_exo.plan import HLC_STATUS, STATUS_STOPPED
 from canopen_exo.signal import Signal
 from fi_gateway import bus_control as wire
 from fi_gateway.bus_control import BusControl, Command, Status, read_command, read_status
@@ -178,7 +179,7 @@ def test_a_spent_injector_can_be_triggered_once_it_is_armed_again() -> None:
     control = live(injector(effect=Once()))
     control.trigger("x", ZERO + 1)
     assert not passes(control, ZERO + 2)
-    with pytest.raises(FaultError, match="spent; arm it first"):
+    with pytest.raises(FaultError, match="spent, its last window, or the motion, is over; arm it"):
         control.trigger("x", ZERO + 3)
     control.arm("x", ZERO + 4)
     assert control.trigger("x", ZERO + 5)
@@ -265,7 +266,7 @@ def test_start_is_time_0_for_a_rig_whose_master_does_not_say_it() -> None:
 def test_start_does_not_move_a_time_0_that_is_known() -> None:
     """Times in the record count from one time 0."""
     control = live(injector())
-    with pytest.raises(FaultError, match=r"since 2\.000 s"):
+    with pytest.raises(FaultError, match=r"it was 2\.000 s ago"):
         control.start(ZERO + 2 * SECOND)
     assert control.gateway.time_zero == ZERO
 
@@ -378,6 +379,24 @@ def test_listing_says_state_counts_and_what_comes_next() -> None:
     assert listing_text([], 0) == "no injectors"
 
 
+def test_listing_says_why_an_injector_does_not_act_by_itself() -> None:
+    """One without an event to come is no more than armed, one that the end of the motion found armed never acted."""
+    control = live(injector("a", event=At((MS,))), injector("b", event=Never()))
+    assert control.listing()[1].state == "armed"
+    assert (
+        listing_text(control.listing(), ZERO)
+        .splitlines()[1]
+        .endswith("0 changed; no event to come, only a trigger or `exo-hil fault trigger` starts it")
+    )
+    control.gateway.receive(ZERO, CONTROLLER_PORT, Frame(HLC_STATUS, bytes((STATUS_STOPPED, 0, 0, 0, 0))), Sink())
+    for line in listing_text(control.listing(), ZERO).splitlines():
+        assert line.endswith("0 changed; the motion was over before it acted")
+    with pytest.raises(FaultError, match="it is spent, the motion is over; arm it"):
+        control.trigger("a", ZERO + 1)
+    control.arm("a", ZERO + 2)
+    assert control.trigger("a", ZERO + 3)
+
+
 def test_statistics_are_by_direction() -> None:
     """Frames, lost, undelivered, notices, and the added latency on the way out."""
     control = live(injector(event=At((0,))))
@@ -394,7 +413,7 @@ def test_statistics_are_by_direction() -> None:
     assert drives.latency is to_drives
     assert statistics_text([drives, controller]).splitlines() == [
         "to_drives: 3 frames, 0 lost by faults, added latency: median 130 us, 99 % 130 us, worst 130 us",
-        "to_controller: 1 frames, 1 lost by faults, 1 error notices",
+        "to_controller: 1 frames, 1 lost by faults, 1 error notice",
     ]
 
 

@@ -78,7 +78,8 @@ def mixes(draw: st.DrawFn) -> str:
         event, effect = draw(st.sampled_from(EVENTS)), draw(st.sampled_from(EFFECTS))
         text = f"{name}: {{target: {target}, fault: {fault}, event: {event}, effect: {effect}"
         sources = ranks[: ranks.index(name)]
-        if sources and draw(st.booleans()):
+        is_triggered = draw(st.booleans())
+        if sources and is_triggered:
             chosen = draw(st.lists(st.sampled_from(sources), min_size=1, unique=True))
             on = draw(st.sampled_from(("activated", "manifested", "ended")))
             key = draw(st.sampled_from(("any", "all")))

@@ -8,6 +8,8 @@ from collections import Counter
 import pytest
 
 from tests.parity.cycles import SENDERS, by_cycle, heartbeats, sender
+from tests.parity.patience import BUSY
+from tests.parity.truth import NEEDED_SHARE, comparable, difference, disturbed
 from tests.parity.walks import VERDICTS, Bench, Walks, judged
 
 
@@ -54,9 +56,13 @@ class Parity:
         assert all(abs(found[can_id] - count) <= 1 for can_id, count in wanted.items())
 
     def test_truth_is_that_of_lock_step(self, walks: Walks) -> None:
-        """The same plant, the same gait, on the same 1 kHz grid from time 0."""
+        """The same plant, the same gait, on the same 1 kHz grid: wherever the same commands acted at the same time."""
         pair = walks("none")
-        found, wanted = pair.real.record.truth, pair.lock_step.truth
-        assert found.t_s.tolist() == wanted.t_s.tolist()
-        # a cycle whose answers came after the deadline repeats old samples: some mrad where nothing else is wrong
-        assert abs(found.q - wanted.q).max() < 0.03
+        found, wanted = pair.real.record, pair.lock_step
+        assert found.truth.t_s.tolist() == wanted.truth.t_s.tolist()
+        where = comparable(found, self.bench.cycle_ns)
+        told = difference(found, wanted, where)
+        assert not told, told
+        if where.mean() < NEEDED_SHARE:
+            count = len(disturbed(found, self.bench.cycle_ns))
+            pytest.skip(f"{BUSY}: {count} cycles were disturbed, {100 * where.mean():.0f} % of the truth compares")

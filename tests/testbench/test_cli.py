@@ -507,3 +507,30 @@ def test_a_bit_rate_of_a_hub_without_bit_time_is_refused(capsys: pytest.CaptureF
     """docs/hub.md: not silently ignored."""
     assert main(["hub", "--listen", "127.0.0.1:0", "--bitrate", "500000"]) == 2
     assert "add --timed" in capsys.readouterr().err
+
+
+def test_options_of_real_time_are_refused_by_the_names_that_were_given(capsys: pytest.CaptureFixture[str]) -> None:
+    """And no others."""
+    assert main(["run", GOLDEN, "--without", "hlc", "--fifo"]) == 2
+    assert capsys.readouterr().err == "--without, --fifo: are of real time; add --realtime\n"
+
+
+@pytest.mark.parametrize(
+    ("word", "done", "said"),
+    [
+        ("trigger x", True, "x: triggered\n"),
+        ("trigger x", False, "x: not triggered, it is active, or waits for a value, already\n"),
+        ("arm x", True, "x: armed\n"),
+        ("disarm x", True, "x: disarmed\n"),
+        ("start", True, "time 0 is now\n"),
+        ("stop", True, "injection is stopped, every frame passes; `exo-hil fault resume` resumes\n"),
+        ("resume", True, "injection goes on\n"),
+    ],
+)
+def test_each_word_of_live_control_says_what_it_did(
+    word: str, done: bool, said: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also that a trigger was ignored."""
+    monkeypatch.setattr("fi_gateway.control_socket.ask", lambda *given: {"ok": True, "done": done})
+    assert main(["fault", *word.split()]) == 0
+    assert capsys.readouterr().out == said

@@ -202,6 +202,12 @@ def test_what_became_of_the_frames_is_counted_and_said(
     assert f"1 activated, {total}\n" in text
 
 
+def test_text_of_an_invalid_run_is_not_headed_with_a_verdict(failed: Summary) -> None:
+    """It proves nothing, so it did not fail either."""
+    text = summary_text({**failed, "valid": False, "outcome": "invalid", "invalid_reasons": ["golden run: too late"]})
+    assert text.splitlines()[0] == "INVALID  knee_freeze, seed 2020: the run is invalid and proves nothing"
+
+
 def test_columns_of_the_text_are_aligned(failed: Summary) -> None:
     """The separators of the joint table stand in one column."""
     table = [line for line in summary_text(failed).splitlines() if "|" in line]

@@ -12,7 +12,7 @@ from testbench.rig import RigParams, build_rig
 from testbench.run import drive_through
 from testbench.scenario import JOINT_NAMES, default_joints
 from testbench.status import StatusLine
-from testbench.watch import ASK_EVERY_NS, CONTROLLER_PORT, DRIVE_PORT, Watch, states_text
+from testbench.watch import ASK_EVERY_NS, CONTROLLER_PORT, DRIVE_PORT, Watch, alarms_text, states_text
 
 PLAN = BusPlan(default_joints(), cycle_ns=10 * MS)
 SYNC = Frame(0x80, b"\x01")
@@ -161,6 +161,25 @@ def test_short_and_foreign_frames_do_no_harm(frame: Frame, port: int) -> None:
     watch.receive(1, port, frame, Sent())
     assert set(watch.states.values()) == {None}
     assert watch.time_zero == NEVER
+
+
+def test_end_of_the_motion_is_told_with_its_cause_and_lateness() -> None:
+    """The first drive that dropped its torque, its code in words; and that the rig was late, when it was."""
+    watch = Watch(PLAN)
+    cycle(watch, 0)
+    for number in range(1, 5):
+        cycle(watch, number * PLAN.cycle_ns)
+    assert watch.timing_words() == ""
+    cycle(watch, 7 * PLAN.cycle_ns, answers=5)
+    cycle(watch, 8 * PLAN.cycle_ns)
+    late = f"the rig was late: 1 of 5 cycles, SYNC off by at most {2 * PLAN.cycle_ns / 1e6:.1f} ms; "
+    assert watch.timing_words().startswith(late + "this machine is too busy for ")
+    for node_id, code in ((2, 0x8700), (1, 0x8250)):
+        watch.receive(0, DRIVE_PORT, Frame(0x80 + node_id, code.to_bytes(2, "little") + bytes(6)), Sent())
+    watch.receive(0, CONTROLLER_PORT, Frame(0x2FF, bytes((STATUS_STOPPED, 0, 0, 0, 0))), Sent())
+    assert watch.ended_by == f"{JOINT_NAMES[1]} dropped its torque: SYNC lost (8700)"
+    expected = f"RPDO time-out (8250): {JOINT_NAMES[0]}; SYNC lost (8700): {JOINT_NAMES[1]}"
+    assert alarms_text(watch.alarms) == expected
 
 
 # --- status line -----------------------------------------------------------------------------------------------------
