@@ -209,7 +209,9 @@ def _way_back(first: str, triggers: Mapping[str, tuple[str, ...]]) -> tuple[str,
     return ()
 
 
-def injector_warnings(specs: Mapping[str, InjectorSpec], plan: BusPlan, duration_ns: int) -> list[str]:
+def injector_warnings(
+    specs: Mapping[str, InjectorSpec], plan: BusPlan, duration_ns: int, by_hand: bool = False
+) -> list[str]:
     """What is allowed and still looks like a mistake: injectors that can never act in a motion of that length [ns]."""
     warnings = []
     live = _live(specs, plan, duration_ns)
@@ -218,7 +220,7 @@ def injector_warnings(specs: Mapping[str, InjectorSpec], plan: BusPlan, duration
             continue
         place = spec.place(plan)
         late = [time for time in spec.event.times() if time >= duration_ns and spec.start == "time_zero"]
-        if name not in live and not late:
+        if name not in live and not late and not (by_hand and isinstance(spec.event, NeverSpec)):
             silent = spec.event.silent(plan)
             reason = f"its event never happens{'' if isinstance(spec.event, NeverSpec) else f' ({silent})'} and " + (
                 "nothing that triggers it can start" if spec.trigger is not None else "it has no trigger"

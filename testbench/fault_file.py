@@ -64,7 +64,7 @@ class FaultFile(SpecModel):
     @property
     def warnings(self) -> list[str]:
         """What is allowed and still looks like a mistake, such as an injector that can never act."""
-        return injector_warnings(self.injectors, self.plan, NEVER)
+        return injector_warnings(self.injectors, self.plan, NEVER, by_hand=True)
 
 
 def no_faults() -> FaultFile:

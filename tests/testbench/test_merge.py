@@ -298,7 +298,7 @@ def test_frames_that_a_fault_takes_are_not_lost_and_others_meanwhile_are(scenari
     """The window of the drop at the left hip, RPDO1, is from 600 to 650 ms."""
     hlc, gateway, joints = parts
     dropped = [one for one in gateway.activations if one.injector == "lost"]
-    assert dropped[0].frames_changed == 5
+    assert dropped[0].frames_lost == 5
     timing = judged(scenario, hlc, replace(gateway, activations=[]), joints)
     assert timing.lost[0].startswith("gateway, frames to the drives that no fault was at: lost: 201 (5)")
 

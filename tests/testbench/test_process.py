@@ -282,7 +282,7 @@ def test_gateway_says_by_direction_what_was_lost_and_when_an_interface_was_off(
     monkeypatch.setattr(DeadChannel, "__init__", dead_with_losses(DeadChannel.__init__))
     buses = (parse_bus("virtual:controller"), parse_bus("virtual:drive"))
 
-    def serve_once(served: process.Session, control: object, can_resume: bool) -> None:
+    def serve_once(served: process.Session, control: object, server: object, can_resume: bool) -> None:
         turns = iter((False, True))
         served.run(lambda now: next(turns))
 
