@@ -148,7 +148,7 @@ def test_a_replay_sends_the_same_frames_at_the_same_times(text: str, seed: int) 
 
 
 def on_wire(sink: Sink) -> list[tuple[int, int, int, bytes, int]]:
-    """As a transmit queue orders it: of what leaves at one instant the lowest id first, those of one id as they came."""
+    """As a transmit queue has it: of what leaves at one instant the lowest id first, those of one id as they came."""
     return sorted(sink.sent, key=lambda row: row[:3])
 
 
