@@ -78,7 +78,7 @@ def mixes(draw: st.DrawFn) -> str:
         event, effect = draw(st.sampled_from(EVENTS)), draw(st.sampled_from(EFFECTS))
         text = f"{name}: {{target: {target}, fault: {fault}, event: {event}, effect: {effect}"
         sources = ranks[: ranks.index(name)]
-        if sources and draw(st.booleans()):
+        if len(sources) > 0 and draw(st.booleans()):
             chosen = draw(st.lists(st.sampled_from(sources), min_size=1, unique=True))
             on, key = draw(st.sampled_from(("activated", "manifested", "ended"))), draw(st.sampled_from(("any", "all")))
             rest = draw(st.sampled_from(("", ", delay: 1.2 ms", ", probability: 50 %", ", edge: level")))
