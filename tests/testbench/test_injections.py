@@ -64,6 +64,7 @@ def test_a_row_says_when_why_and_what_became_of_the_frames(tmp_path: Path, activ
         "due_s": "3.000000000", "start_s": "3.000000000", "duration_s": "0.300000000", "end_s": "3.300000000",
         "frames_seen": "150", "frames_unfit": "0", "frames_injected": "150", "frames_manifested": "148",
         "frames_changed": "148", "frames_lost": "0", "frames_delayed": "0", "frames_inserted": "0", "saturated": "0",
+        "attempts_seen": "0", "attempts_disturbed": "0",
         "first_frame_s": "3.001000000", "first_before": "185#0102030405060708", "first_after": "185#0000000005060708",
         "skipped": "0", "stream": "",
     }
