@@ -74,6 +74,7 @@ class Watch(Node):
         tpdo2 = plan.pdo("TPDO2")
         self._status_codec: Final = tpdo2.codec()
         self._statusword_at: Final[int] = tpdo2.place("statusword")
+        self._started: int = 0
         self._asking: int = -1
         self._sync_ns: int = NEVER
         self._answers: Final[set[int]] = set()
@@ -181,8 +182,10 @@ class Watch(Node):
         if len(data) < 5:
             return
         if data[0] == ids.STATUS_STOPPED != self.motion:
-            dropped = [alarm for alarm in self.alarms if alarm.code in _DROPS_TORQUE]
+            dropped = [alarm for alarm in self.alarms[self._started :] if alarm.code in _DROPS_TORQUE]
             self.ended_by = f"{dropped[0].joint} dropped its torque: {error_words(dropped[0].code)}" if dropped else ""
+        elif data[0] == ids.STATUS_STARTING != self.motion:
+            self._started = len(self.alarms)
         self.motion = data[0]
         if data[0] == ids.STATUS_MOTION:
             if self.time_zero == NEVER:

@@ -5,6 +5,8 @@ from pathlib import Path
 import pytest
 
 from canopen_exo.bus.node import MS
+from fi_gateway.control import LiveControl
+from fi_gateway.gateway import Gateway
 from fi_gateway.marked_yaml import FileErrors
 from fi_gateway.schema import build_injectors
 from testbench.cli import main
@@ -95,8 +97,19 @@ def test_example_is_checked_and_said_in_words(capsys: pytest.CaptureFixture[str]
     """`exo-hil check faults.yaml` says what the gateway will do, and where time 0 comes from."""
     assert main(["check", str(EXAMPLE)]) == 0
     said = capsys.readouterr()
-    assert said.err == ""
+    # of the one that only a person starts, no more is warned of than that
+    assert all("dead_sensor: will stay silent" in line for line in said.err.splitlines())
     faults = load_faults(EXAMPLE)
     assert said.out.splitlines() == describe_faults(faults)
     assert "time 0: the controller's status frame (COB-ID 0x2FF), or `exo-hil fault start`" in said.out
     assert len(build_injectors(faults.injectors, faults.plan, faults.seed, 0)) == 3
+
+
+def test_injector_of_the_example_that_is_started_by_hand_acts_when_it_is_triggered() -> None:
+    """Its comment says how; an event that is over when it is armed would leave it without effect."""
+    faults = load_faults(EXAMPLE)
+    gateway = Gateway(build_injectors(faults.injectors, faults.plan, faults.seed, 0), faults.plan.cycle_ns)
+    control = LiveControl(gateway)
+    control.start(0)
+    assert control.trigger("dead_sensor", 3_000_000_000)
+    assert [row.state for row in control.listing() if row.name == "dead_sensor"] == ["active"]
