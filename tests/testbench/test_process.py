@@ -289,7 +289,7 @@ def test_gateway_says_by_direction_what_was_lost_and_when_an_interface_was_off(
     monkeypatch.setattr(gateway_process, "_serve", serve_once)
     assert gateway_main(faults_of(scenario), buses, ProcessOptions(), GatewayOptions()) == 0
     said = capsys.readouterr().err.splitlines()
-    lost = "0 lost by faults, 2 lost before they were read, 1 unreadable, 3 not taken by the interface, 1 error notices"
+    lost = "0 lost by faults, 2 lost before they were read, 1 unreadable, 3 not taken by the interface, 1 error notice"
     assert f"gateway: to_drives: 0 frames, {lost}" in said
     assert f"gateway: to_controller: 0 frames, {lost}" in said
     assert "gateway: controller side: bus off at -1.500 s: bus-off" in said
