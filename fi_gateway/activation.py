@@ -79,6 +79,18 @@ class Activation:
         """Frames changed, lost, delayed or inserted."""
         return self.frames_changed + self.frames_lost + self.frames_delayed + self.frames_inserted
 
+    def count_passage(self, frame: Frame, result: Frame | None, late: int, inserted: int) -> int:
+        """Count a frame that is lost, late, or did not stay alone; late, inserted: frames; how many have manifested."""
+        if result is None and late:
+            late -= 1
+            self.frames_delayed += 1
+        elif result is None:
+            self.frames_lost += 1
+        elif result != frame:
+            self.frames_changed += 1
+        self.frames_inserted += late + inserted
+        return late + inserted + (1 if result is None or result != frame else 0)
+
     def __reduce__(
         self,
     ) -> tuple[type["Activation"], tuple[str, int, str, str, int, int, int], dict[str, object]]:
