@@ -87,6 +87,18 @@ class Activation:
         frames = self.frames_changed + self.frames_lost + self.frames_delayed + self.frames_inserted
         return frames + self.attempts_disturbed
 
+    def count_passage(self, frame: Frame, result: Frame | None, late: int, inserted: int) -> int:
+        """Count a frame that is lost, late, or did not stay alone; late, inserted: frames; how many have manifested."""
+        if result is None and late:
+            late -= 1
+            self.frames_delayed += 1
+        elif result is None:
+            self.frames_lost += 1
+        elif result != frame:
+            self.frames_changed += 1
+        self.frames_inserted += late + inserted
+        return late + inserted + (1 if result is None or result != frame else 0)
+
     def __reduce__(
         self,
     ) -> tuple[type["Activation"], tuple[str, int, str, str, int, int, int], dict[str, object]]:

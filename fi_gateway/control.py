@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final, final
 from canopen_exo.bus.lateness import Lateness
 from canopen_exo.bus.losses import Losses
 from canopen_exo.bus.node import NEVER
+from canopen_exo.plan import HLC_STATUS
 from fi_gateway.errors import FaultError
 from fi_gateway.gateway import CONTROLLER_PORT, DRIVE_PORT, Gateway
 from fi_gateway.injector import ACTIVE, ARMED, INERT, SPENT, WAITING, Injector
@@ -123,12 +124,22 @@ class LiveControl:
         return True
 
     def start(self, now: int, source: str = "call") -> None:
-        """Time 0 is now, for a rig whose master does not say it on the bus. Refused when it is known already."""
+        """Time 0 is now, for a rig whose master does not say it on the bus. Refused when it is known already.
+
+        And while an injector is armed that hangs on what such a master does not say either.
+        """
         zero = self.gateway.time_zero
         if zero != NEVER:
             ago_s = (now - zero) / 1e9
             why = f"time 0 is known already, it was {ago_s:.3f} s ago, and does not move; restart the gateway"
             raise self._refused(now, START, "", source, why)
+        for injector in self.gateway.injectors:
+            if injector.enabled and (CONTROLLER_PORT, HLC_STATUS) in injector.watches():
+                why = (
+                    f"injector {injector.name} waits for the controller's status frames (gait_phase, HLC_status), and "
+                    "one that sends them says time 0 itself; disarm it first"
+                )
+                raise self._refused(now, START, "", source, why)
         self.gateway.settle(now - 1)
         self.gateway.begin(now)
         self._done(now, START, "", source)

@@ -18,7 +18,7 @@ from fi_gateway.errors import FaultError
 from fi_gateway.events import Event
 from fi_gateway.faults.base import Fault
 from fi_gateway.on_wire import OnWire
-from fi_gateway.outlet import Tray
+from fi_gateway.outlet import Line, Tray
 from fi_gateway.repair import Repair
 from fi_gateway.rng_state import state_of
 from fi_gateway.trigger import Report, Trigger
@@ -66,6 +66,7 @@ _INJECTOR_STATE: Final = (
     "_instant_ns",
     "_arrived",
     "_used_ns",
+    "_is_put_off",
 )
 """What `__reduce__` copies besides the constructor arguments."""
 
@@ -93,18 +94,6 @@ class Target:
 
     def __reduce__(self) -> tuple[type["Target"], tuple[bool, bool, tuple[int, ...], str, bool]]:
         return Target, (self.to_controller, self.to_drives, self.cob_ids, self.name, self.on_bus)
-
-
-@final
-class Line:
-    """Frames of one COB-ID that wait behind an injector in the order they came. at_ns: when the last one goes on."""
-
-    def __init__(self, at_ns: int) -> None:
-        self.at_ns: int = at_ns
-        self.waiting: int = 0
-
-    def __reduce__(self) -> tuple[type["Line"], tuple[int], dict[str, object]]:
-        return Line, (self.at_ns,), {"waiting": self.waiting}
 
 
 @final
@@ -201,6 +190,7 @@ class Injector:
         self._instant_ns: int = -NEVER
         self._arrived: int = 0
         self._used_ns: int = -NEVER
+        self._is_put_off: bool = False
 
     @property
     def port(self) -> int:
@@ -237,21 +227,24 @@ class Injector:
         """Live control: no more injection until armed again; an open window ends at `now`."""
         self.enabled = False
         self.close(now)
+        self._is_put_off = False
         if self.phase is not SPENT:
             self.phase, self.next_ns = INERT, NEVER
 
     def open(self, now: int, cause: str, is_met: bool = False) -> Activation | None:
-        """Open the window at `now`; None when the fault has to wait. For a waiting one the first cause stays.
+        """Open the window at `now`; None when it has to wait. For a waiting one the first cause stays.
 
-        is_met: with a target frame that has just reached it. Without one, a window that opens when a target frame has
-        passed in this instant, or with which the last one ended, starts with the next one.
+        It waits for a value that the fault needs, and for the next instant when the last window has met a frame in this
+        one, or when a target frame has passed in it. is_met: with the one that has just reached the injector, though.
         """
-        if self.phase is not WAITING:
+        if self.phase is not WAITING and not self._is_put_off:
             self._cause, self._due_ns = cause, now
         start_ns = now if now > self._due_ns else self._due_ns  # a frame stamped before a command, read after it
         passed = self._arrived if self._instant_ns == start_ns else 0
-        if start_ns < self.end_ns or (passed and not is_met):
-            start_ns, passed = start_ns + 1, 0
+        self._is_put_off = start_ns < self.end_ns or (passed > 0 and not is_met)
+        if self._is_put_off:
+            self.phase, self.next_ns = ARMED, start_ns + 1
+            return None
         stream = state_of(self._fault_rng)
         if not self._fault.begin(start_ns, self.held, self._fault_rng):
             self.phase, self.next_ns = WAITING, NEVER
@@ -310,7 +303,10 @@ class Injector:
             self.injected += 1
             current.frames_injected += 1
             if tray.used or result is None:
-                self._count_passage(now, current, frame, result, tray)
+                self.manifested += current.count_passage(frame, result, len(tray.late), len(tray.inserted))
+                self.has_news = self.has_news or tray.used
+                if not self.has_manifested:
+                    self._first(now, current, frame, _shown(frame, result, tray))
             elif result != frame:
                 self.manifested += 1
                 current.frames_changed += 1
@@ -414,7 +410,7 @@ class Injector:
         self.close(now)
         if current is not None and current.duration_ns >= NEVER and self._effect.frames == 0:
             current.end_ns = NEVER
-        self.phase, self.next_ns = SPENT, NEVER
+        self.phase, self.next_ns, self._is_put_off = SPENT, NEVER, False
 
     def __reduce__(self) -> tuple[type["Injector"], tuple[object, ...], dict[str, object]]:
         given = (self.name, self.target, self._fault, self._event, self._effect, self.trigger, self._rng)
@@ -423,7 +419,7 @@ class Injector:
         return Injector, (*given, self.enabled, self.from_power_up, *more), state
 
     def _arm(self, relative_ns: int) -> None:
-        self.phase = ARMED
+        self.phase, self._is_put_off = ARMED, False
         self.next_ns = NEVER if relative_ns >= NEVER else min(self._base_ns + relative_ns, NEVER)
 
     def _is_due(self, now: int, starts: bool, ends: bool) -> bool:
@@ -441,28 +437,6 @@ class Injector:
                 self.close(now + 1)
                 self.has_news = self.has_turned = True
 
-    def _count_passage(self, now: int, current: Activation, frame: Frame, result: Frame | None, tray: Tray) -> None:
-        """Count a frame that is lost, late, or did not stay alone."""
-        later, inserted = len(tray.late), len(tray.inserted)
-        if result is None and later:
-            later -= 1
-            current.frames_delayed += 1
-        elif result is None:
-            current.frames_lost += 1
-        elif result != frame:
-            current.frames_changed += 1
-        self.manifested += later + inserted + (1 if result is None or result != frame else 0)
-        current.frames_inserted += later + inserted
-        if not self.has_manifested:
-            after = result
-            if result is None and tray.late:
-                after = tray.late[0].frame
-            elif result is not None and result == frame:
-                after = tray.inserted[0] if tray.inserted else tray.late[0].frame
-            self._first(now, current, frame, after)
-        if tray.used:
-            self.has_news = True
-
     def _first(self, now: int, current: Activation, before: Frame | None, after: Frame | None) -> None:
         """The window has manifested."""
         current.first_ns, current.first_before, current.first_after = now, before, after
@@ -475,6 +449,15 @@ class Injector:
         assert self._repair is not None
         tray.repair(self._repair, frame)
         return None if result is None else self._repair.frame(frame, result)
+
+
+def _shown(frame: Frame, result: Frame | None, tray: Tray) -> Frame | None:
+    """What a record shows for a frame that is lost, late, or did not stay alone; None: lost."""
+    if result is not None and result != frame:
+        return result
+    if result is not None and tray.inserted:
+        return tray.inserted[0]
+    return tray.late[0].frame if tray.late else None
 
 
 def stream(seed: int, run: int, name: str) -> Generator:

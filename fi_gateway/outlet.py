@@ -39,6 +39,18 @@ class Later:
 
 
 @final
+class Line:
+    """Frames of one COB-ID that wait behind an injector in the order they came. at_ns: when the last one goes on."""
+
+    def __init__(self, at_ns: int) -> None:
+        self.at_ns: int = at_ns
+        self.waiting: int = 0
+
+    def __reduce__(self) -> tuple[type["Line"], tuple[int], dict[str, object]]:
+        return Line, (self.at_ns,), {"waiting": self.waiting}
+
+
+@final
 class Tray(Outlet):
     """Keeps what one call of a fault has sent, in order, until it is taken. used: there is something."""
 

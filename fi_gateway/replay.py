@@ -3,8 +3,9 @@
 What a fault itself draws while it is active (bits to flip, frames to lose) comes from its stream, which is put where it
 stood when the recorded window opened. So the same rig gives the same frames again, and another rig meets the same
 faults.
-Left out: the order of frames within the nanosecond in which a condition (`until`) ends a window. If a frame that a
-fault had put off or added comes then and is met, the one that ends the window is met in the replay as well.
+Left out: the order of what happens within one nanosecond when several frames are under way in it. A frame that ends a
+window (`until`) is met after all if one that a fault had put off or added was met just before it; and where two faults
+add frames with one and the same frame, one of them by its own clock, a third fault meets that one's first.
 """
 
 from dataclasses import dataclass

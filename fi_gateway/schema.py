@@ -10,12 +10,13 @@ from typing import Annotated, Final, Literal
 from numpy.random import Generator
 from pydantic import Field
 
-from canopen_exo.plan import BusPlan
+from canopen_exo.plan import HLC_STATUS, BusPlan
 from fi_gateway.boundary import Count, Flag, SpecError, SpecModel, tag, validate
 from fi_gateway.chain import draw_chains
 from fi_gateway.effect_specs import InfiniteSpec
 from fi_gateway.errors import FaultError
 from fi_gateway.event_specs import NeverSpec
+from fi_gateway.events import FROM_CONTROLLER
 from fi_gateway.fault_specs import FaultChoice, FaultSpec, WireFaultSpec
 from fi_gateway.injector import Injector, Target, stream
 from fi_gateway.marked_yaml import Data, Keys, did_you_mean, dotted
@@ -233,6 +234,16 @@ def injector_warnings(
             cob_ids = place.name.removeprefix("frames ")
             warnings.append(f"injectors.{name}.target.cob_id: nothing in this rig sends {cob_ids}")
     return warnings
+
+
+def status_watchers(specs: Mapping[str, InjectorSpec], plan: BusPlan) -> list[str]:
+    """The injectors whose event or effect reads the status frames (COB-ID 0x2FF) that our controller alone sends."""
+    status, found = (FROM_CONTROLLER, HLC_STATUS), []
+    for name, spec in specs.items():
+        rng = stream(0, 0, name)
+        if status in spec.event.build(plan, rng).watches or status in spec.effect.build(plan, rng).watches:
+            found.append(name)
+    return found
 
 
 def _live(specs: Mapping[str, InjectorSpec], plan: BusPlan, duration_ns: int) -> set[str]:

@@ -127,9 +127,9 @@ def _run(options: argparse.Namespace) -> int:
         scenario, replay = _loaded(options)
         buses = _real_time_buses(options)
         if options.realtime:
-            from testbench.realtime_run import check_expectations
+            from testbench.realtime_run import check_without
 
-            check_expectations(scenario, frozenset(options.without))
+            check_without(scenario, frozenset(options.without))
             refuse_wire_faults(scenario.injectors, "exo-hil run --realtime")
         changes = [*options.overrides, *(("replay",) if replay is not None else ())]
         folder = options.out or default_folder(scenario.name, scenario.seed, changes)
@@ -168,7 +168,9 @@ def _run(options: argparse.Namespace) -> int:
     limits = {name: limits_of(name) for name in names}
     title = f"{scenario.name}, seed {scenario.seed}"
     files = result_files(scenario.resolved_yaml(), result.document, names, result.golden, result.faulted)
-    files.update(plot_files(Plotted(title, names, limits, result.golden, result.faulted, result.judgement)))
+    triggers = {name: spec.trigger for name, spec in scenario.injectors.items() if spec.trigger is not None}
+    shown = Plotted(title, names, limits, result.golden, result.faulted, result.judgement, triggers)
+    files.update(plot_files(shown))
     try:
         written = write_result(folder, files)
     except BenchError as error:

@@ -253,7 +253,7 @@ def _read_faults(options: argparse.Namespace) -> "FaultFile | None":
     except FileErrors as error:
         print(error, file=sys.stderr)
         return None
-    for warning in [] if options.no_faults else faults.warnings:
+    for warning in [] if options.no_faults or options.supervisor else faults.warnings:
         print(f"warning: {warning}", file=sys.stderr)
     return faults
 

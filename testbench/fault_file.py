@@ -17,7 +17,7 @@ from canopen_exo.plan import BusPlan
 from fi_gateway.boundary import Later, SpecModel, Text, validate
 from fi_gateway.marked_yaml import Data, Document, apply_override, load
 from fi_gateway.quantity import format_hertz
-from fi_gateway.schema import InjectorSpec, describe_injectors, injector_warnings
+from fi_gateway.schema import InjectorSpec, describe_injectors, injector_warnings, status_watchers
 from testbench.scenario import (
     Cycle,
     Name,
@@ -35,6 +35,11 @@ SCENARIO_ONLY: Final = frozenset({"motion", "expect", "fail_on", "tolerance", "r
 
 WORDS_NS: Final = 60 * SECOND
 """For how long the number of activations is told; a gateway has no end of its own."""
+
+_STATUS_NEEDED: Final = (
+    "waits for what `exo-hil hlc` says on the bus (COB-ID 0x2FF); with another controller it never comes, and "
+    "`exo-hil fault start` is refused"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +69,10 @@ class FaultFile(SpecModel):
     @property
     def warnings(self) -> list[str]:
         """What is allowed and still looks like a mistake, such as an injector that can never act."""
-        return injector_warnings(self.injectors, self.plan, NEVER, by_hand=True)
+        return [
+            *injector_warnings(self.injectors, self.plan, NEVER, by_hand=True),
+            *(f"injectors.{name}: {_STATUS_NEEDED}" for name in status_watchers(self.injectors, self.plan)),
+        ]
 
 
 def no_faults() -> FaultFile:

@@ -6,13 +6,14 @@ from typing import Final
 from testbench.child import ProcessError
 from testbench.gateway_process import active_faults
 from testbench.status import StatusLine
-from testbench.supervisor import Setup, Supervisor
+from testbench.supervisor import Setup, Supervisor, check_status_readers
 
 PASS: Final = 0
 
 
 def run_up(setup: Setup) -> int:
     """Start the rig and keep it until Ctrl-C or SIGTERM, which is its normal end (0). Raises BenchError."""
+    check_status_readers(setup)
     line: StatusLine | None = None
 
     is_over = False

@@ -24,7 +24,7 @@ from testbench.record import RunRecord
 from testbench.run import CHUNK_NS, LEAVE_NS, START_NS, Progress, Result
 from testbench.scenario import Scenario
 from testbench.summary import RealTimeEntry, RealTimeRunEntry, summary_document
-from testbench.supervisor import Setup, Supervisor
+from testbench.supervisor import Setup, Supervisor, check_status_readers
 from testbench.timing import Timing, TimingLimits, judge_timing
 from testbench.verdict import judge
 
@@ -62,7 +62,7 @@ def run_realtime(
     places: where own hub and live control listen, see Setup; announce: told what foreign software is waited for.
     Raises BenchError when a run gives nothing to judge: a process died, a part is missing, the motion never began.
     """
-    check_expectations(scenario, without)
+    check_without(scenario, without)
     started = time.perf_counter()
     listen, control = places
     setup = Setup(scenario, buses, without, faults=False, keep_parts=True, fifo=fifo, listen=listen, control=control)
@@ -203,8 +203,9 @@ def _gather(rig: Supervisor, setup: Setup) -> RealTimeRun:
     return RealTimeRun(record, timing)
 
 
-def check_expectations(scenario: Scenario, without: frozenset[str]) -> None:
+def check_without(scenario: Scenario, without: frozenset[str]) -> None:
     """A foreign controller does not say what it follows, a foreign gateway not what it did: raises BenchError."""
+    check_status_readers(Setup(scenario, without=without))
     for line in scenario.expect:
         needed = ""
         if "hlc" in without and line.path.startswith("golden.tracking_rmse"):

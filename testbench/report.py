@@ -1,4 +1,4 @@
-"""Plots of a judged pair of runs, as PNG: the joint at fault in detail, and all joints at a glance.
+"""Plots of a judged pair of runs, as PNG: the joint at fault in detail, all joints at a glance, who started whom.
 
 Units are the table's (deg, rpm, N m). The golden run is a broad pale line and the faulted run a narrow dark one on
 top, so that both can be seen where they are equal. Drawn without a display and without pyplot's global state.
@@ -6,14 +6,16 @@ top, so that both can be seen where they are equal. Drawn without a display and 
 
 import textwrap
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from canopen_exo.bus.node import NEVER
+from fi_gateway.trigger_specs import TriggerSpec
 from hlc.limits import JointLimits
+from testbench.chain_figure import CHAIN_PLOT, chain_figure
 from testbench.golden import clip
 from testbench.record import Array, RunRecord, Truth, motion_rows
 from testbench.store import Writer
@@ -39,7 +41,7 @@ _RPM: Final = 30 / np.pi
 
 @dataclass(frozen=True, slots=True)
 class Plotted:
-    """What the plots show. title: scenario and seed; limits: by joint name."""
+    """What the plots show. title: scenario and seed; limits: by joint name; triggers: by the injector they start."""
 
     title: str
     joints: tuple[str, ...]
@@ -47,14 +49,19 @@ class Plotted:
     golden: RunRecord
     faulted: RunRecord
     judgement: Judgement
+    triggers: Mapping[str, TriggerSpec] = field(default_factory=dict)
 
 
 def plot_files(shown: Plotted) -> dict[str, Writer]:
     """File name -> writer of every plot, for the result folder."""
-    return {
+    files: dict[str, Writer] = {
         FAULT_PLOT: lambda path: save(fault_figure(shown), path),
         JOINTS_PLOT: lambda path: save(joints_figure(shown), path),
     }
+    if shown.triggers:
+        activations = shown.faulted.activations
+        files[CHAIN_PLOT] = lambda path: save(chain_figure(shown.triggers, activations, shown.title), path)
+    return files
 
 
 def save(figure: "Figure", path: Path) -> None:

@@ -36,7 +36,7 @@ FILES: Final = frozenset(
         INJECTIONS_FILE,
         *("controller.log", "drive.log", "golden_controller.log", "golden_drive.log"),
         *("golden.parquet", "faulted.parquet", "golden_commands.parquet", "faulted_commands.parquet"),
-        *("fault.png", "joints.png"),
+        *("fault.png", "joints.png", "triggers.png"),
     }
 )
 """What a result folder may hold; a folder with anything else in it is somebody's, and never replaced."""

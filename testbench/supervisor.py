@@ -25,6 +25,7 @@ from canopen_exo.bus.node import MS, NEVER, SECOND
 from canopen_exo.bus.realtime import RealTimeLoop
 from canopen_exo.emcy import error_words
 from fi_gateway.control_socket import is_path, remove_left
+from fi_gateway.schema import status_watchers
 from testbench.child import Process, ProcessError
 from testbench.errors import BenchError
 from testbench.process import DONE, ENDED_EARLY, Orders, open_bus
@@ -75,6 +76,16 @@ class Setup:
     fifo: bool = False
     listen: str = "127.0.0.1:0"
     control: str = ""
+
+
+def check_status_readers(setup: Setup) -> None:
+    """Injectors that hang on what our controller says, where it is foreign: raises BenchError."""
+    if "hlc" in setup.without and "gateway" not in setup.without and setup.faults:
+        for name in status_watchers(setup.scenario.injectors, setup.scenario.plan):
+            raise BenchError(
+                f"injectors.{name}: waits for what our controller says on the bus (gait_phase, conditions over "
+                "HLC_status), and it is left out; take --without hlc away, or give another event or effect"
+            )
 
 
 @final

@@ -33,13 +33,17 @@ ON_SIGNALS: Final = (
     "{type: noise, uniform: 2 deg}", "{type: bit_flip, count: 3}", "{type: bit_flip, count: 2, bits: fixed}",
     "{type: time_delay, lag: 3 ms}",
 )  # fmt: skip
+CLOCKED: Final = "{type: insert, cob_id: 0x185, payload: '01 02 03 04 05 06 07 08', every: 3 ms}"
+ADDING: Final = (
+    "{type: duplicate}", "{type: insert, payload: '01 02 03 04 05 06 07 08'}",
+    "{type: masquerade, as: 0x186, copy: true}",
+)  # fmt: skip
 ON_FRAMES: Final = (
     "{type: drop, probability: 40 %}", "{type: drop, p: 20 %, r: 30 %}", "{type: delay, time: 1.5 ms}",
-    "{type: delay, time: 1 ms, law: {type: exponential, mean: 2 ms}, reorder: true}", "{type: duplicate}",
+    "{type: delay, time: 1 ms, law: {type: exponential, mean: 2 ms}, reorder: true}", ADDING[0],
     "{type: duplicate, copies: 2, gap: 0.7 ms}", "{type: replay, frames: 2}", "{type: resequence, span: 5 ms}",
-    "{type: insert, cob_id: 0x185, payload: '01 02 03 04 05 06 07 08', every: 3 ms}",
-    "{type: insert, payload: '01 02 03 04 05 06 07 08'}", "{type: corrupt_dlc}", "{type: bit_flip, count: 2}",
-    "{type: masquerade, as: 0x186, copy: true}", "{type: stuck_at}",
+    CLOCKED, ADDING[1], "{type: corrupt_dlc}", "{type: bit_flip, count: 2}",
+    ADDING[-1], "{type: stuck_at}",
 )  # fmt: skip
 EVENTS: Final = (
     "{type: at, times: [4 ms, 21 ms]}", "{type: failure_probability, p: 0.1, per: 1 ms}",
@@ -47,9 +51,10 @@ EVENTS: Final = (
     "{type: when, condition: right_knee.position < 0 deg}", "{type: rate, lambda: 60 1/s}", "{type: never}",
     "{type: when, condition: right_knee.target_torque > 0 N m, edge: level}",
 )  # fmt: skip
+UNTIL: Final = "{type: until, condition: right_knee.position > 0 deg}"
 EFFECTS: Final = (
     "{type: once}", "{type: frames, n: 3}", "{type: constant_time, duration: 4 ms}", "{type: infinite}",
-    "{type: mttr, mean: 5 ms, sd: 2 ms}", "{type: until, condition: right_knee.position > 0 deg}",
+    "{type: mttr, mean: 5 ms, sd: 2 ms}", UNTIL,
 )  # fmt: skip
 
 
@@ -66,7 +71,10 @@ class Sink(Out):
 
 @st.composite
 def mixes(draw: st.DrawFn) -> str:
-    """The injectors of a file: any target, fault, event and effect, triggers without circles in any written order."""
+    """The injectors of a file: any target, fault, event and effect, triggers without circles in any written order.
+
+    Without what fi_gateway.replay leaves out: several frames in one instant.
+    """
     names = INJECTORS[: draw(st.integers(1, 4))]
     ranks = draw(st.permutations(names))
     lines = []
@@ -78,8 +86,7 @@ def mixes(draw: st.DrawFn) -> str:
         event, effect = draw(st.sampled_from(EVENTS)), draw(st.sampled_from(EFFECTS))
         text = f"{name}: {{target: {target}, fault: {fault}, event: {event}, effect: {effect}"
         sources = ranks[: ranks.index(name)]
-        is_triggered = draw(st.booleans())
-        if sources and is_triggered:
+        if draw(st.booleans()) and sources:
             chosen = draw(st.lists(st.sampled_from(sources), min_size=1, unique=True))
             on = draw(st.sampled_from(("activated", "manifested", "ended")))
             key = draw(st.sampled_from(("any", "all")))
@@ -89,8 +96,11 @@ def mixes(draw: st.DrawFn) -> str:
             text += ", report: {frame: {cob_id: 0x6F0, data: '01'}, on: manifested}"
         lines.append(text + "}")
     text = "\n".join(lines)
-    if "until" in text:  # see fi_gateway.replay, left out
-        text = text.replace("span: 5 ms", "span: 4.3 ms").replace("every: 3 ms", "every: 3.1 ms")
+    if CLOCKED in text:
+        for other in ADDING:
+            text = text.replace(other, "{type: corrupt_dlc}")
+    if MANY in text or "resequence" in text or "insert" in text:  # several frames in one instant
+        text = text.replace(UNTIL, "{type: infinite}")
     return text
 
 
@@ -150,7 +160,7 @@ def test_a_replay_sends_the_same_frames_at_the_same_times(text: str, seed: int) 
 
 
 def on_wire(sink: Sink) -> list[tuple[int, int, int, bytes, int]]:
-    """As a transmit queue has it: of what leaves at one instant the lowest id first, those of one id as they came."""
+    """As a transmit queue orders it: of one instant the lowest id first, those of one id as they came."""
     return sorted(sink.sent, key=lambda row: row[:3])
 
 

@@ -157,8 +157,8 @@ def test_manifested_catches_the_same_frame_in_those_written_behind() -> None:
     gateway, _ = run(1000, order, ((60, tpdo()), (70, tpdo())))
     assert [(one.injector, one.start_ns, one.frames_seen) for one in gateway.records] == [
         ("a", 50, 2),
-        ("before", 61, 1),
         ("behind", 60, 2),
+        ("before", 61, 1),
     ]
 
 
