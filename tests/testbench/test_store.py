@@ -65,7 +65,7 @@ def fail_with(error: BaseException) -> Writer:
 def test_folder_holds_what_the_design_lists(tmp_path: Path, files: dict[str, Writer]) -> None:
     """Design: scenario as run, summary.json, a candump log per bus, joint traces as Parquet; no other files."""
     folder = write_result(tmp_path / "results" / "x-1", files)
-    assert set(names(folder)) == FILES - {"fault.png", "joints.png"}
+    assert set(names(folder)) == FILES - {"fault.png", "joints.png", "triggers.png"}
     assert names(folder.parent) == ["x-1"]
     assert (folder / "scenario.yaml").read_text() == "name: x\n"
     assert b"\r" not in (folder / "summary.json").read_bytes()
