@@ -136,8 +136,8 @@ class LiveControl:
         for injector in self.gateway.injectors:
             if injector.enabled and (CONTROLLER_PORT, HLC_STATUS) in injector.watches():
                 why = (
-                    f"injector {injector.name} waits for the controller's status frames (gait_phase, HLC_status), and "
-                    "one that sends them says time 0 itself; disarm it first"
+                    f"injector {injector.name} waits for the controller's status frames (gait_phase), and one that "
+                    "sends them says time 0 itself; disarm it first"
                 )
                 raise self._refused(now, START, "", source, why)
         self.gateway.settle(now - 1)

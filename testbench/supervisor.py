@@ -83,8 +83,8 @@ def check_status_readers(setup: Setup) -> None:
     if "hlc" in setup.without and "gateway" not in setup.without and setup.faults:
         for name in status_watchers(setup.scenario.injectors, setup.scenario.plan):
             raise BenchError(
-                f"injectors.{name}: waits for what our controller says on the bus (gait_phase, conditions over "
-                "HLC_status), and it is left out; take --without hlc away, or give another event or effect"
+                f"injectors.{name}: waits for what our controller says on the bus (gait_phase), and it is left "
+                "out; take --without hlc away, or give another event"
             )
 
 

@@ -32,7 +32,7 @@ from fi_gateway.control import (
 )
 from fi_gateway.effects import ConstantTime, Effect, Infinite, Once
 from fi_gateway.errors import FaultError
-from fi_gateway.events import At, Event, Never
+from fi_gateway.events import At, Event, GaitPhase, Never
 from fi_gateway.faults import Drop, Fault, StuckAt, StuckAtValue
 from fi_gateway.gateway import CONTROLLER_PORT, DRIVE_PORT, Gateway
 from fi_gateway.injector import Injector, Target, stream
@@ -268,6 +268,17 @@ def test_start_does_not_move_a_time_0_that_is_known() -> None:
     control = live(injector())
     with pytest.raises(FaultError, match=r"it was 2\.000 s ago"):
         control.start(ZERO + 2 * SECOND)
+    assert control.gateway.time_zero == ZERO
+
+
+def test_start_is_refused_while_an_armed_injector_waits_for_a_phase_of_the_gait() -> None:
+    """design.md: with a foreign master, time 0 is `exo-hil fault start` and gait_phase is refused."""
+    control = live(injector("phase", event=GaitPhase(0.3)), injector("x"), time_zero=False)
+    with pytest.raises(FaultError, match=r"injector phase waits for the .* status frames .*; disarm it first"):
+        control.start(ZERO)
+    assert control.gateway.time_zero == NEVER
+    control.disarm("phase", ZERO)
+    control.start(ZERO)
     assert control.gateway.time_zero == ZERO
 
 

@@ -13,10 +13,10 @@ from canopen_exo.bus.node import MS, NEVER, Node, Out
 from canopen_exo.signal import Signal
 from fi_gateway.bus_control import BusControl
 from fi_gateway.control import LiveControl
-from fi_gateway.effects import ConstantTime, Effect, Infinite, Once
+from fi_gateway.effects import ConstantTime, Effect, Frames, Infinite, Once
 from fi_gateway.errors import FaultError
-from fi_gateway.events import At, Event, Never
-from fi_gateway.faults import Bias, Drop, Fault, StuckAt, StuckAtValue
+from fi_gateway.events import At, Event, Every, Never
+from fi_gateway.faults import Bias, Drop, Fault, Insert, StuckAt, StuckAtValue
 from fi_gateway.gateway import CONTROLLER_PORT, DRIVE_PORT, Gateway
 from fi_gateway.injector import Injector, Target, stream
 from fi_gateway.trigger import BusFrame, Report, Trigger
@@ -160,6 +160,49 @@ def test_manifested_catches_the_same_frame_in_those_written_behind() -> None:
         ("behind", 60, 2),
         ("before", 61, 1),
     ]
+
+
+def test_a_window_that_was_put_off_holds_the_frame_that_had_passed() -> None:
+    """The stuck value is the last one before the window, which begins after the frame that started it."""
+    before = injector("before", trigger=Trigger(("a",), "manifested"), fault=StuckAt(COUNT))
+    gateway, sink = run(1000, [before, injector("a", At((50,)), Once())], ((40, tpdo(3)), (60, tpdo(7)), (70, tpdo(9))))
+    assert [(one.injector, one.due_ns, one.start_ns) for one in gateway.records] == [("a", 50, 50), ("before", 60, 61)]
+    assert [frame.data for _, frame in sink.sent[1:]] == [b"\x03", b"\x08", b"\x07"]
+
+
+@pytest.mark.parametrize("effect", [Once(), Frames(1), Frames(3)])
+def test_frames_inserted_by_their_own_clock_are_counted_by_the_effect(effect: Effect) -> None:
+    """events.md: so many frames acted on or inserted; the target frames that go past meanwhile do not count."""
+    extra = Frame(0x1FF, b"\x01")
+    traffic = tuple((time, tpdo()) for time in range(51, 100, 3))
+    gateway, sink = run(1000, [injector("a", At((50,)), effect, fault=Insert(extra, 10))], traffic)
+    (one,) = gateway.records
+    assert [frame for _, frame in sink.sent].count(extra) == effect.frames == one.frames_inserted
+    assert one.end_ns == 50 + 10 * (effect.frames - 1) + 1
+    assert one.first_ns == 50
+
+
+def test_a_frame_that_a_fault_spares_does_not_use_an_effect_up() -> None:
+    """events.md: n frames the fault acted on; a drop by chance goes on until it has lost so many."""
+    traffic = tuple((time, tpdo()) for time in range(60, 960))
+    gateway, _ = run(9000, [injector("a", At((50,)), Frames(4), fault=Drop(0.2))], traffic)
+    (one,) = gateway.records
+    assert one.frames_lost == one.frames_injected == 4
+    assert one.frames_seen > 4
+
+
+def test_an_event_in_the_instant_with_which_a_window_ended_is_passed_over() -> None:
+    """Its window [t0, t + 1) still holds then; the next one counts."""
+    gateway, _ = run(1000, [injector("a", Every(1), Frames(1))], ((60, tpdo()), (60, tpdo()), (70, tpdo())))
+    assert opened(gateway) == [("a", 60, "event"), ("a", 70, "event")]
+
+
+def test_a_disarmed_window_ends_after_what_it_has_met_in_that_instant() -> None:
+    """end_ns is the first instant outside the window."""
+    one = injector("a", At((50,)))
+    gateway, _ = run(60, [one], ((60, tpdo()),))
+    one.disarm(60)
+    assert [(record.end_ns, record.frames_seen) for record in gateway.records] == [(61, 1)]
 
 
 def test_once_has_ended_after_its_frame_not_on_it() -> None:

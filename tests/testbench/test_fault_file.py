@@ -47,6 +47,16 @@ def test_injectors_alone_are_enough(tmp_path: Path) -> None:
     assert faults.warnings == []
 
 
+def test_a_gait_phase_is_warned_of(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """design.md: gait_phase comes from the HLC's status frame alone; at a foreign master nobody sends it."""
+    faults = read(tmp_path, SILENCE.replace("{type: at, time: 20 s}", "{type: gait_phase, phase: 30 %}"))
+    assert isinstance(faults, FaultFile)
+    (warning,) = faults.warnings
+    assert warning.startswith("injectors.silence: waits for what `exo-hil hlc` says on the bus (COB-ID 0x2FF)")
+    assert main(["check", str(tmp_path / "f.yaml")]) == 0
+    assert f"warning: {warning}" in capsys.readouterr().err
+
+
 def test_rig_of_a_scenario_may_stay(tmp_path: Path) -> None:
     """Who copies a scenario and takes its motion out has a fault file; the rate counts."""
     faults = read(tmp_path, f"rig: {{plant: suspended, stops: off, rate: 100 Hz}}\nseed: 3\n{SILENCE}")

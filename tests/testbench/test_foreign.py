@@ -219,3 +219,16 @@ def test_expectation_that_needs_the_part_left_out_is_refused(
     assert f"expect: {line!r} needs our {needed}, and it is left out; remove one of them" in said
     assert code == 2
     assert not (tmp_path / "result").exists()
+
+
+@pytest.mark.parametrize("verb", [["run", "--realtime"], ["up"]])
+def test_gait_phase_without_our_controller_is_refused(
+    tmp_path: Path, verb: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """design.md: with a foreign master gait_phase is refused, before anything starts."""
+    file = tmp_path / "scenario.yaml"
+    file.write_text(BASE + BIAS.replace("{type: at, time: 0.3 s}", "{type: gait_phase, phase: 30 %}"))
+    place = ["--out", str(tmp_path / "result")] if verb[0] == "run" else []
+    assert main([*verb, "--without", "hlc", str(file), *place]) == 2
+    assert "waits for what our controller says on the bus (gait_phase" in capsys.readouterr().err
+    assert not (tmp_path / "result").exists()
