@@ -1,9 +1,10 @@
 """The picture of who started whom: everything linked is on it, and nothing lies on something else."""
 
 from collections.abc import Callable
-from itertools import combinations
+from itertools import combinations, pairwise
 from pathlib import Path
 
+import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -54,7 +55,7 @@ def test_every_linked_injector_and_frame_is_there_with_what_it_did(activation_ma
 def test_boxes_and_labels_do_not_cover_each_other() -> None:
     """Also where an arrow passes a column."""
     figure = chain_figure(BRANCHES, [], "x")
-    renderer = FigureCanvasAgg(figure).get_renderer()
+    renderer = FigureCanvasAgg(figure).get_renderer()  # type: ignore[no-untyped-call]
     (axes,) = figure.axes
     found = [patch.get_window_extent(renderer) for patch in boxes(figure)]
     found += [text.get_window_extent(renderer) for text in axes.texts if text.get_text() and text.get_bbox_patch()]
@@ -79,11 +80,12 @@ def test_an_arrow_that_passes_a_column_goes_through_no_box() -> None:
     figure = chain_figure(BRANCHES, [], "x")
     (axes,) = figure.axes
     for line in axes.lines:
-        for (left, above), (right, below) in zip(line.get_xydata()[:-1], line.get_xydata()[1:], strict=True):
+        points = np.asarray(line.get_xydata())
+        for (left, above), (right, below) in pairwise(points.tolist()):
             for box in boxes(figure):
                 inside = box.get_x() < (left + right) / 2 < box.get_x() + box.get_width()
                 assert not (inside and box.get_y() < (above + below) / 2 < box.get_y() + box.get_height())
-    assert any(len(line.get_xdata()) > 2 for line in axes.lines)
+    assert any(len(np.asarray(line.get_xdata())) > 2 for line in axes.lines)
 
 
 @pytest.mark.parametrize("name", ["a" * 200, "$x^2$", "Fußgelenk & Co."])
