@@ -244,8 +244,6 @@ class PythonCanChannel(Channel):
             self._state = read_error_frame(can_id, data if len(data) == 8 else b"", self._state)
             arrivals.append(Arrival(stamp, None, self._state))
             return
-        if not message.is_rx:  # our own, from an interface that gives them back all the same
-            return
         frame = from_message(message)
         if frame is None:
             self.malformed += 1
