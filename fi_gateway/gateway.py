@@ -283,8 +283,7 @@ class Gateway(Relay):
     def _note_passes(self) -> None:
         """Say which frames need nothing from here."""
         for port, table in ((CONTROLLER_PORT, self._from_controller), (DRIVE_PORT, self._from_drives)):
-            for cob_id, route in enumerate(table):
-                self.passes[port][cob_id] = 1 if route is None else 0
+            self.passes[port] = bytearray([1 if route is None else 0 for route in table])
 
     def _power_on(self, now: int) -> None:
         """The first frame: start the injectors that count from here."""

@@ -45,6 +45,19 @@ class Lateness:
         else:
             self._bins[_bin(delay_ns if delay_ns > 0 else 0)] += 1
 
+    def add_since(self, times: list[int], now: int) -> None:
+        """Count the delays of these times until `now`."""
+        bins = self._bins
+        for time_ns in times:  # as `add`
+            delay_ns = now - time_ns
+            if 15 < delay_ns <= _TOP_NS:
+                octave = delay_ns.bit_length() - 4
+                bins[(octave << 3) + (delay_ns >> octave)] += 1
+            else:
+                bins[_bin(delay_ns if delay_ns > 0 else 0)] += 1
+        self.count += len(times)
+        self.worst_ns = max(self.worst_ns, now - min(times, default=now))
+
     def percentile(self, share: float) -> int:
         """The delay [ns] that at least `share` (0..1) of the values do not exceed: its bin's upper edge."""
         if not 0.0 <= share <= 1.0:

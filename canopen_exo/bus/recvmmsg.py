@@ -1,7 +1,8 @@
-"""Many records with one system call: recvmmsg(2), which Python's socket module does not have.
+"""Many records with one system call: recvmmsg(2) and sendmmsg(2), which Python's socket module does not have.
 
-Source: recvmmsg(2), recvmsg(2), cmsg(3); socket(7) for SO_TIMESTAMPNS and SO_RXQ_OVFL. ctypes lays the structures out
-for the machine at hand. Where the C library or the kernel has no recvmmsg, recvmsg gives the same, one record a call.
+Source: recvmmsg(2), sendmmsg(2), recvmsg(2), cmsg(3); socket(7) for SO_TIMESTAMPNS and SO_RXQ_OVFL. ctypes lays the
+structures out for the machine at hand. Where the C library or the kernel has no recvmmsg, recvmsg gives the same, one
+record a call; without sendmmsg nothing goes out from here, and the caller sends as it can.
 Leaves out: the senders' addresses, and what a datagram has beyond the 72 bytes of the longest CAN record.
 """
 
@@ -27,6 +28,12 @@ SO_RXQ_OVFL: Final = 40
 _PLAIN_SIZE: Final = 16
 """linux/can.h: struct can_frame."""
 
+_LENGTH_AT: Final = 4
+"""linux/can.h: of the data length in both."""
+
+_WORD: Final = 4
+_ID: Final = struct.Struct("=I")
+
 _CONTROL_SIZE: Final = 64
 """Bytes for control messages: a stamp (16 + 16) and a drop count (16 + 8), which comes only after a drop."""
 
@@ -37,12 +44,15 @@ _COUNT: Final = struct.Struct("@I")
 _STAMP_SIZE: Final = _CONTROL_HEAD.size + _TIME.size
 _STAMP_AT: Final = _CONTROL_HEAD.size
 _FIRST_STAMP: Final = _TIME.unpack_from
+_FIRST_ID: Final = _ID.unpack_from
 _STAMPS: Final = struct.Struct(f"@{_CONTROL_HEAD.size}xll{_CONTROL_SIZE - _STAMP_SIZE}x")
 _RECORDS: Final = struct.Struct(f"{_PLAIN_SIZE}s{RECORD_SIZE - _PLAIN_SIZE}x")
 _SECOND: Final = 1_000_000_000
 
 _MISSING: Final = (errno.ENOSYS, errno.EPERM)
 """A kernel without the call, or a sandbox that refuses it."""
+
+_NOW: Final = getattr(socket, "MSG_DONTWAIT", 0)  # Windows has none, nor these calls
 
 Stamped = tuple[int, bytes]
 """The kernel's stamp [ns] on CLOCK_REALTIME, -1 without one; the record."""
@@ -82,7 +92,8 @@ class Receiver:
     """Reads from sockets that stamp what comes (SO_TIMESTAMPNS) and count what they drop (SO_RXQ_OVFL).
 
     count: records of the last `read`. is_plain: all of them are classical (16 bytes), stamped, and told of no drop;
-    `plain` and `stamps` have them then, `stamped` in any case. drops: the running total last told, -1 for none.
+    `plain` and `stamps` have them then, `stamped` in any case. views: their bytes; outgoing: where they stand
+    for sendmmsg. drops: the running total last told, -1 for none.
     is_untold: with a record that was not plain there was more to tell, of drops, than there was room for.
     """
 
@@ -97,15 +108,21 @@ class Receiver:
         self._error: OSError | None = None
         self._records: Final[bytearray] = bytearray(SLOTS * RECORD_SIZE)
         self._controls: Final[bytearray] = bytearray(SLOTS * _CONTROL_SIZE)
-        self._first_record: Final = memoryview(self._records)[:_PLAIN_SIZE]
+        self._words: Final = memoryview(self._records).cast("I")
+        self.views: Final = [
+            memoryview(self._records)[at : at + _PLAIN_SIZE] for at in range(0, SLOTS * RECORD_SIZE, RECORD_SIZE)
+        ]
         self._slots: Final = (_Slot * SLOTS)()
         self._vectors: Final = (_Vector * SLOTS)()
+        self._outgoing: Final = (_Slot * SLOTS)()
+        self._cut: Final = (_Vector * SLOTS)()
         self._slots_at: Final = ctypes.c_void_p(ctypes.addressof(self._slots))
         heads = memoryview(self._slots).cast("B")
         fresh = self._lay_out()
+        self.outgoing: Final = self._lay_out_again()
         # by the number of records: the heads; as they have to be before a call, and as plain records leave them, from
         # a bus and (MSG_DONTROUTE) from a socket of this machine
-        self._views: Final = [heads[: number * _SLOT_SIZE] for number in range(SLOTS + 1)]
+        self._heads: Final = [heads[: number * _SLOT_SIZE] for number in range(SLOTS + 1)]
         self._fresh: Final = _beginnings(fresh)
         self._plain: Final = _beginnings(_as_plain(fresh, 0))
         self._plain_local: Final = _beginnings(_as_plain(fresh, socket.MSG_DONTROUTE))
@@ -115,9 +132,9 @@ class Receiver:
         self.drops = -1
         self._socket = can
         self._error = None
-        call = find_recvmmsg()
+        call = find_call("recvmmsg")
         # all arguments made beforehand: converting them costs as much as the call
-        many = None if call is None else partial(call, can.fileno(), self._slots_at, SLOTS, socket.MSG_DONTWAIT, None)
+        many = None if call is None else partial(call, can.fileno(), self._slots_at, SLOTS, _NOW, None)
         self._read_many = many
 
     def read(self) -> int:
@@ -129,27 +146,36 @@ class Receiver:
         if count < 0:
             return self._fail()
         self.count = count
-        heads = self._views[count].tobytes()
+        heads = self._heads[count].tobytes()
         if heads == self._plain[count] or heads == self._plain_local[count]:
             self.is_plain = True  # and room is left for a stamp only: a drop count shows as truncated (MSG_CTRUNC)
         else:
             self.is_plain = False
-            self._views[count][:] = self._fresh[count]
+            self._heads[count][:] = self._fresh[count]
             self._take_apart(heads)
         return count
 
-    def first(self) -> tuple[bytes, int, int]:
-        """The first of plain records, with its stamp: seconds and nanoseconds of CLOCK_REALTIME."""
+    def first(self) -> tuple[int, int, int, int]:
+        """Of the first of plain records: id, data length, and its stamp, seconds and nanoseconds of CLOCK_REALTIME."""
         seconds, nanos = _FIRST_STAMP(self._controls, _STAMP_AT)
-        return self._first_record.tobytes(), seconds, nanos
+        return _FIRST_ID(self._records)[0], self._records[_LENGTH_AT], seconds, nanos
+
+    def ids(self) -> list[int]:
+        """The first word of every plain record: id and flags."""
+        step = RECORD_SIZE // _WORD
+        return self._words[: self.count * step : step].tolist()
+
+    def longest(self) -> int:
+        """The largest data length that a plain record claims to have."""
+        return max(self._records[_LENGTH_AT : self.count * RECORD_SIZE : RECORD_SIZE])
+
+    def record(self, number: int) -> bytes:
+        """One of the plain records."""
+        return self.views[number].tobytes()
 
     def plain(self) -> Iterator[tuple[bytes]]:
         """The plain records, 16 bytes each."""
         return _RECORDS.iter_unpack(memoryview(self._records)[: self.count * RECORD_SIZE])
-
-    def unpack(self, layout: struct.Struct) -> Iterator[tuple[int, int]]:
-        """Two fields of every plain record. layout: of `RECORD_SIZE` bytes."""
-        return layout.iter_unpack(memoryview(self._records)[: self.count * RECORD_SIZE])
 
     def stamps(self) -> Iterator[tuple[int, int]]:
         """The stamps of the plain records: seconds and nanoseconds of CLOCK_REALTIME."""
@@ -178,6 +204,16 @@ class Receiver:
             message.control = ctypes.addressof(controls) + number * _CONTROL_SIZE
             message.control_size = _CONTROL_SIZE
         return bytes(self._slots)
+
+    def _lay_out_again(self) -> list[ctypes.c_void_p]:
+        """The same places for sending: 16 bytes of each, no control messages."""
+        for number in range(SLOTS):
+            self._cut[number].base = self._vectors[number].base
+            self._cut[number].size = _PLAIN_SIZE
+            message = self._outgoing[number].message
+            message.vectors = ctypes.addressof(self._cut[number])
+            message.vector_count = 1
+        return [ctypes.c_void_p(ctypes.addressof(slot)) for slot in self._outgoing]
 
     def _take_apart(self, heads: bytes) -> None:
         """Records of any size, with any control messages."""
@@ -245,6 +281,27 @@ class Receiver:
         return self.count
 
 
+@final
+class Sender:
+    """Sends plain records out of the buffers of a Receiver."""
+
+    def __init__(self) -> None:
+        self._send_many: Callable[..., int] | None = None
+
+    def attach(self, can: socket.socket) -> None:
+        """Send on this socket from now on. One of a class of its own may have its own way of sending, so none there."""
+        call = find_call("sendmmsg") if type(can) is socket.socket else None
+        self._send_many = None if call is None else partial(call, can.fileno())
+
+    def send(self, source: Receiver, start: int, end: int) -> int:
+        """Those of the plain records last read, without waiting; how many went. What stopped the next is not told."""
+        many = self._send_many
+        if many is None:
+            return 0
+        count = many(source.outgoing[start], end - start, _NOW)
+        return count if count > 0 else 0
+
+
 def _as_plain(fresh: bytes, flags: int) -> bytes:
     """The heads after a call that filled every slot with a plain record. flags: as the kernel sets them."""
     slots = (_Slot * SLOTS).from_buffer_copy(fresh)
@@ -260,8 +317,8 @@ def _beginnings(heads: bytes) -> list[bytes]:
     return [heads[: number * _SLOT_SIZE] for number in range(SLOTS + 1)]
 
 
-def find_recvmmsg() -> Callable[..., int] | None:
-    """The C library's function, which never waits and so keeps the interpreter's lock; None where there is none."""
+def find_call(name: str) -> Callable[..., int] | None:
+    """A function of the C library, which is not to wait and so keeps the interpreter's lock; None where there is none."""
     if sys.platform != "linux":
         return None
-    return getattr(ctypes.PyDLL(None, use_errno=True), "recvmmsg", None)
+    return getattr(ctypes.PyDLL(None, use_errno=True), name, None)

@@ -1,13 +1,13 @@
 """A Relay served by records: what goes out, and what the node sees of it, is as if every frame had been handled."""
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from canopen_exo.bus.channel import Arrival, RecordArrival, RecordChannel
+from canopen_exo.bus.channel import Arrival, RecordChannel
 from canopen_exo.bus.frame import FLAG_EXTENDED, Frame
 from canopen_exo.bus.node import NEVER, ErrorState, Out, PortState, Relay
 from canopen_exo.bus.realtime import RealTimeLoop
-from canopen_exo.bus.socketcan import decode, encode
 
 LOOKED_AT, DISTURBING, CALMING = 1, 2, 3
 """Ids the node wants to see; the last two switch `is_disturbed` on and off."""
@@ -23,6 +23,7 @@ class FakeRecordChannel(RecordChannel):
         self.inbox: list[tuple[int, Frame | PortState]] = []
         self.sent: list[Frame] = []
         self.records = 0
+        self.found: list[Arrival] = []
 
     def fileno(self) -> int:
         return self.fd
@@ -35,20 +36,16 @@ class FakeRecordChannel(RecordChannel):
         self.inbox = []
         return found
 
-    def receive_records(self, place: int) -> list[RecordArrival]:
-        found: list[RecordArrival] = []
-        for arrival in self.receive():
-            frame = arrival.frame
-            if frame is None or frame.flags:
-                found.append((arrival.stamp_ns, place, -1, b"", arrival))
-            else:
-                found.append((arrival.stamp_ns, place, frame.can_id, encode(frame), None))
-        return found
+    def read(self) -> bool:
+        self.found = self.receive()
+        self.count = len(self.found)
+        frames = [arrival.frame for arrival in self.found]
+        self.ids = [frame.can_id for frame in frames if frame is not None and not frame.flags]
+        self.stamps = [arrival.stamp_ns for arrival in self.found]
+        return len(self.ids) == self.count
 
-    def frame_in(self, record: bytes) -> Frame:
-        frame = decode(record)
-        assert frame is not None
-        return frame
+    def arrival(self, number: int) -> Arrival:
+        return self.found[number]
 
     def send(self, frame: Frame) -> bool:
         if self.takes == 0:
@@ -57,8 +54,13 @@ class FakeRecordChannel(RecordChannel):
         self.sent.append(frame)
         return True
 
-    def send_record(self, record: bytes) -> bool:
-        taken = self.send(self.frame_in(record))
+    def send_run(self, source: RecordChannel, start: int, end: int) -> int:
+        assert isinstance(source, FakeRecordChannel)
+        taken = 0
+        for arrival in source.found[start:end]:
+            if arrival.frame is None or not self.send(arrival.frame):
+                break
+            taken += 1
         self.records += taken
         return taken
 
@@ -67,11 +69,11 @@ class FakeRecordChannel(RecordChannel):
 
 
 class Diarist(Relay):
-    """Passes frames on, writes down what it has to look at, and is woken every 10 ns."""
+    """Passes frames on, writes down what it has to look at, and is woken at `wake_at` and every 10 ns from then."""
 
-    def __init__(self) -> None:
+    def __init__(self, wake_at: int) -> None:
         super().__init__()
-        self.wake_at = 10
+        self.wake_at = wake_at
         self.seen: list[tuple[int, int]] = []
         for table in self.passes:
             table[:] = bytes(can_id not in (LOOKED_AT, DISTURBING, CALMING) for can_id in range(0x800))
@@ -97,6 +99,10 @@ things = st.one_of(
     st.builds(Frame, st.integers(0, 12), st.binary(max_size=8), st.just(FLAG_EXTENDED)),
     st.just(PortState(0, ErrorState.WARNING, 96, 0, "")),
 )
+plain_traffic = st.lists(
+    st.tuples(st.integers(0, 1), st.integers(0, 9), st.builds(Frame, st.integers(0, 12), st.binary(max_size=8))),
+    max_size=40,
+)
 traffic = st.lists(st.tuples(st.integers(0, 1), st.integers(0, 9), things), max_size=40)
 """Port, ns since the one before it, and what comes."""
 
@@ -106,6 +112,7 @@ def served(
     second: list[tuple[int, int, Frame | PortState]],
     takes: int,
     record: bool,
+    wake_at: int = 10,
 ) -> list[object]:
     """All that shows of a run: `first` comes at once, then `second`, when the channels take all that waits again."""
     now = 0
@@ -118,7 +125,7 @@ def served(
             channels[port].inbox.append((now, thing))
 
     come(first)
-    node = Diarist()
+    node = Diarist(wake_at)
     loop = RealTimeLoop(
         node,
         list(channels),
@@ -150,20 +157,59 @@ def test_records_are_served_as_frames_are(
     assert served(first, second, takes, record=False) == served(first, second, takes, record=True)
 
 
-def test_only_what_the_node_does_not_want_goes_as_a_record() -> None:
-    """A wake-up that is due comes first; what is looked at, disturbed or of another kind is handled."""
+@given(plain_traffic, plain_traffic, st.sampled_from((0, 1, 5, 1 << 30)))
+def test_runs_of_records_are_served_as_frames_are(
+    first: list[tuple[int, int, Frame | PortState]], second: list[tuple[int, int, Frame | PortState]], takes: int
+) -> None:
+    """The same where base data frames come alone and no wake-up is due, so that they go in runs."""
+    assert served(first, second, takes, False, NEVER) == served(first, second, takes, True, NEVER)
+
+
+def outcome(kinds: list[Frame], wake_at: int) -> tuple[int, int]:
+    """How many of those that come at 0, 1, ... ns go out on the other channel, and how many of them as records."""
     channels = [FakeRecordChannel(10, 100), FakeRecordChannel(11, 100)]
-    kinds = (LOOKED_AT, 7, DISTURBING, 7, CALMING, 7, 8)
-    channels[0].inbox = [(stamp, Frame(can_id, b"")) for stamp, can_id in enumerate(kinds)]
-    channels[0].inbox.append((8, Frame(7, b"", FLAG_EXTENDED)))
-    channels[0].inbox.append((11, Frame(7, b"")))  # behind the wake-up at 10
-    node = Diarist()
+    channels[0].inbox = list(enumerate(kinds))
     loop = RealTimeLoop(
-        node, list(channels), [0, 1], 0, clock=lambda: 12, wait=lambda readers, writers, _: (readers, writers)
+        Diarist(wake_at), list(channels), [0, 1], 0, clock=lambda: 12, wait=lambda readers, writers, _: (readers, writers)
     )
     turns = iter((False, True))
     loop.run(lambda _: next(turns))
-    assert len(channels[1].sent) == 9
-    assert channels[1].records == 3
-    assert node.wake_at == 20
-    assert node.wake_at < NEVER
+    return len(channels[1].sent), channels[1].records
+
+
+def base(*ids: int) -> list[Frame]:
+    return [Frame(can_id, b"") for can_id in ids]
+
+
+@pytest.mark.parametrize(
+    ("kinds", "wake_at", "records"),
+    [
+        (base(7, 8), NEVER, 2),
+        (base(7), NEVER, 1),
+        (base(LOOKED_AT), NEVER, 0),
+        (base(7, LOOKED_AT, 7, 8), NEVER, 3),
+        (base(7, DISTURBING, 7, 8), NEVER, 1),  # from there on all are handled
+        (base(7, 8), 1, 2),  # at one instant a frame comes before a wake-up
+        (base(7, 8), 0, 0),  # a wake-up that is due between them
+        ([*base(7), Frame(7, b"", FLAG_EXTENDED)], NEVER, 0),
+    ],
+)
+def test_only_what_the_node_does_not_want_goes_as_a_record(kinds: list[Frame], wake_at: int, records: int) -> None:
+    """What is looked at, disturbed, of another kind or comes with a wake-up that is due is handled."""
+    assert outcome(kinds, wake_at) == (len(kinds), records)
+
+
+def test_a_table_that_changes_within_a_batch_is_followed() -> None:
+    """A frame that is looked at may change what is looked at next (`passes` is replaced then)."""
+
+    class Curious(Diarist):
+        def receive(self, now: int, port: int, frame: Frame, out: Out) -> None:
+            super().receive(now, port, frame, out)
+            self.passes[0] = bytearray(0x800)
+
+    channels = [FakeRecordChannel(10, 100), FakeRecordChannel(11, 100)]
+    channels[0].inbox = list(enumerate(base(7, LOOKED_AT, 7, 8)))
+    loop = RealTimeLoop(Curious(NEVER), list(channels), [0, 1], 0, wait=lambda readers, writers, _: (readers, writers))
+    turns = iter((False, True))
+    loop.run(lambda _: next(turns))
+    assert (len(channels[1].sent), channels[1].records) == (4, 1)
