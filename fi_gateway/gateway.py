@@ -227,6 +227,8 @@ class Gateway(Relay):
                 injector.start(time_zero)
         self._passage.plan()
         self.wake_at = self._passage.next_ns
+        if self._power_up != NEVER and not self._has_wire and self._passage.release_sync():
+            self._note_passes()
 
     def attend(self, now: int) -> None:
         """A wire fault has done something: see to it at `now` what comes of that."""

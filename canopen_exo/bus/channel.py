@@ -13,14 +13,14 @@ from typing import Final, final
 from mypy_extensions import mypyc_attr
 
 from canopen_exo.bus.frame import Frame
-from canopen_exo.bus.node import MS, NEVER, PortState
+from canopen_exo.bus.node import MS, NEVER, SECOND, PortState
 
 _COMPARISONS: Final = 5
 _COMPARED_WITHIN_NS: Final = 5_000
 """A process that is interrupted between two clocks compares them again, four times at most; the closest counts."""
 
-_COMPARED_FOR_NS: Final = MS
-"""How long a comparison holds: a wall clock that is being slewed drifts by 0.5 us in it (500 ppm, adjtimex(2))."""
+_COMPARED_FOR_NS: Final = 10 * MS
+"""How long a comparison holds. Both clocks are slewed alike (adjtimex(2)); only setting the wall clock parts them."""
 
 
 @final
@@ -111,10 +111,9 @@ class RecordChannel(Channel):
 class StampClock:
     """Stamps of CLOCK_REALTIME (the kernel's, python-can's) on the loop's clock.
 
-    Both clocks are compared anew for every batch, at most once a millisecond, so a corrected wall clock does no harm: a
+    Both clocks are compared anew, at most every 10 ms, so a corrected wall clock does no harm: a
     stamp lies between the one before it and now, whatever the wall clock did meanwhile.
-    now: of the last `begin`; offset: what to take from a stamp, ns; last: the stamp given last. A channel that reads
-    many stamps at once does what `at` does by itself.
+    now: of the last `begin`; offset: what to take from a stamp, ns; last: the stamp given last.
     """
 
     def __init__(self) -> None:
@@ -157,3 +156,15 @@ class StampClock:
             stamp = self.last
         self.last = stamp
         return stamp
+
+    def many(self, seconds: list[int], nanos: list[int]) -> list[int]:
+        """As `at` for at least one stamp of CLOCK_REALTIME, in two parts."""
+        if seconds.count(seconds[0]) == len(seconds):
+            start = seconds[0] * SECOND - self.offset
+            stamps = [start + nano for nano in nanos]
+        else:
+            stamps = [second * SECOND + nano - self.offset for second, nano in zip(seconds, nanos, strict=True)]
+        if stamps[0] < self.last or stamps[-1] > self.now or stamps != sorted(stamps):
+            return [self.at(stamp + self.offset) for stamp in stamps]
+        self.last = stamps[-1]
+        return stamps

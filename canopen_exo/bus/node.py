@@ -92,7 +92,7 @@ class Relay(Node):
     frames: received so far, by port. passes: by port and 11-bit CAN id, 1 where all that `receive` does with a base
     data frame is to count it in `frames` and send it on the other port; a loop may do that in its stead, without
     making a Frame. When that changes, a table is replaced, not written to. is_disturbed: it does more at present,
-    whatever `passes` says.
+    whatever `passes` says; only `port_changed` makes it so.
     """
 
     def __init__(self) -> None:

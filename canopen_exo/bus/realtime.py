@@ -164,7 +164,7 @@ class RealTimeLoop:
         collecting = gc.isenabled()
         gc.disable()
         try:
-            while not until(self.now()):
+            while not until(self._clock() - self.epoch_ns):
                 self._turn()
         finally:
             for line in self._lines:

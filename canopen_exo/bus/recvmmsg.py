@@ -12,7 +12,7 @@ import os
 import socket
 import struct
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from typing import Final, final
 
@@ -45,8 +45,9 @@ _STAMP_SIZE: Final = _CONTROL_HEAD.size + _TIME.size
 _STAMP_AT: Final = _CONTROL_HEAD.size
 _FIRST_STAMP: Final = _TIME.unpack_from
 _FIRST_ID: Final = _ID.unpack_from
-_STAMPS: Final = struct.Struct(f"@{_CONTROL_HEAD.size}xll{_CONTROL_SIZE - _STAMP_SIZE}x")
-_RECORDS: Final = struct.Struct(f"{_PLAIN_SIZE}s{RECORD_SIZE - _PLAIN_SIZE}x")
+_LONG: Final = struct.calcsize("l")
+_SECONDS_AT: Final = _STAMP_AT // _LONG
+_STEP: Final = _CONTROL_SIZE // _LONG
 _SECOND: Final = 1_000_000_000
 
 _MISSING: Final = (errno.ENOSYS, errno.EPERM)
@@ -92,7 +93,8 @@ class Receiver:
     """Reads from sockets that stamp what comes (SO_TIMESTAMPNS) and count what they drop (SO_RXQ_OVFL).
 
     count: records of the last `read`. is_plain: all of them are classical (16 bytes), stamped, and told of no drop;
-    `plain` and `stamps` have them then, `stamped` in any case. views: their bytes; outgoing: where they stand
+    `record`, `seconds` and `nanos` have them then, `stamped`
+    in any case. views: their bytes; outgoing: where they stand
     for sendmmsg. drops: the running total last told, -1 for none.
     is_untold: with a record that was not plain there was more to tell, of drops, than there was room for.
     """
@@ -109,6 +111,7 @@ class Receiver:
         self._records: Final[bytearray] = bytearray(SLOTS * RECORD_SIZE)
         self._controls: Final[bytearray] = bytearray(SLOTS * _CONTROL_SIZE)
         self._words: Final = memoryview(self._records).cast("I")
+        self._longs: Final = memoryview(self._controls).cast("l")
         self.views: Final = [
             memoryview(self._records)[at : at + _PLAIN_SIZE] for at in range(0, SLOTS * RECORD_SIZE, RECORD_SIZE)
         ]
@@ -173,21 +176,21 @@ class Receiver:
         """One of the plain records."""
         return self.views[number].tobytes()
 
-    def plain(self) -> Iterator[tuple[bytes]]:
-        """The plain records, 16 bytes each."""
-        return _RECORDS.iter_unpack(memoryview(self._records)[: self.count * RECORD_SIZE])
+    def seconds(self) -> list[int]:
+        """Of the stamps of the plain records, on CLOCK_REALTIME."""
+        return self._longs[_SECONDS_AT : self.count * _STEP : _STEP].tolist()
 
-    def stamps(self) -> Iterator[tuple[int, int]]:
-        """The stamps of the plain records: seconds and nanoseconds of CLOCK_REALTIME."""
-        return _STAMPS.iter_unpack(memoryview(self._controls)[: self.count * _CONTROL_SIZE])
+    def nanos(self) -> list[int]:
+        """The rest of these stamps."""
+        return self._longs[_SECONDS_AT + 1 : self.count * _STEP : _STEP].tolist()
 
     def stamped(self) -> list[Stamped]:
         """All records of the last `read`, of whatever size."""
         if not self.is_plain:
             return self._found
         found = []
-        for (record,), (seconds, nanos) in zip(self.plain(), self.stamps(), strict=True):
-            found.append((seconds * _SECOND + nanos, record))
+        for number, (seconds, nanos) in enumerate(zip(self.seconds(), self.nanos(), strict=True)):
+            found.append((seconds * _SECOND + nanos, self.record(number)))
         return found
 
     def _lay_out(self) -> bytes:

@@ -211,7 +211,7 @@ class SocketCanChannel(RecordChannel):
         if self._socket is not None:
             try:
                 count = self._receiver.read()
-                if self._receiver.is_plain and not self._is_down and not self._notices and self._is_base(count, now):
+                if self._receiver.is_plain and not self._is_down and not self._notices and self._is_base(count):
                     self.count = count
                     return True
                 self._take_all(now)
@@ -294,32 +294,21 @@ class SocketCanChannel(RecordChannel):
         self._sender.attach(can)
         self._fd = can.fileno()
 
-    def _is_base(self, count: int, now: int) -> bool:
+    def _is_base(self, count: int) -> bool:
         """Whether plain records are base data frames, as nearly all are; then `ids` and `stamps` tell of them."""
         receiver = self._receiver
-        clock = self._stamps
         if count == 1:
             can_id, length, seconds, nanos = receiver.first()
             if can_id > 0x7FF or length > 8:
                 return False
             self.ids = [can_id]
-            self.stamps = [clock.at(seconds * SECOND + nanos)]
+            self.stamps = [self._stamps.at(seconds * SECOND + nanos)]
             return True
         ids = receiver.ids()
         if max(ids) > 0x7FF or receiver.longest() > 8:
             return False
-        stamps = []
-        offset, last = clock.offset, clock.last
-        for seconds, nanos in receiver.stamps():
-            stamp = seconds * SECOND + nanos - offset  # as StampClock.at
-            if stamp > now:
-                stamp = now
-            if stamp < last:
-                stamp = last
-            last = stamp
-            stamps.append(stamp)
-        clock.last = last
-        self.ids, self.stamps = ids, stamps
+        self.ids = ids
+        self.stamps = self._stamps.many(receiver.seconds(), receiver.nanos())
         return True
 
     def _take_all(self, now: int) -> None:

@@ -54,17 +54,34 @@ def test_stamps_never_go_back(clocks: FakeTime) -> None:
     stamps = StampClock()
     stamps.begin(EPOCH)
     first = stamps.at(WALL)
-    clocks.pass_by(MS)
+    clocks.pass_by(10 * MS)
     clocks.wall += 3600 * SECOND
     stamps.begin(EPOCH)
     assert stamps.at(WALL + MS // 2) == first
 
 
 def test_corrected_wall_clock_is_followed(clocks: FakeTime) -> None:
-    """The clocks are compared for every batch."""
+    """The clocks are compared every 10 ms."""
     stamps = StampClock()
     stamps.begin(EPOCH)
     clocks.pass_by(10 * MS)
     clocks.wall += 7 * SECOND
     stamps.begin(EPOCH)
     assert stamps.at(clocks.wall - MS) == 5 * SECOND + 9 * MS
+
+
+@pytest.mark.parametrize(
+    ("first", "later"),
+    [(WALL - 5 * MS, (MS, MS, 2 * MS)), (WALL - 5 * MS, (3 * MS, -MS, MS)), (WALL - 2 * MS, (MS, 9 * MS, -20 * MS))],
+)
+def test_many_stamps_are_what_they_are_one_by_one(clocks: FakeTime, first: int, later: tuple[int, ...]) -> None:
+    """Also where they go back, lie in the future, or the second changes among them."""
+    times = [first - SECOND // 2, first]
+    for step in later:
+        times.append(times[-1] + step)
+    one, many = StampClock(), StampClock()
+    one.begin(EPOCH)
+    many.begin(EPOCH)
+    parts = [divmod(time_ns, SECOND) for time_ns in times]
+    assert many.many([part[0] for part in parts], [part[1] for part in parts]) == [one.at(time_ns) for time_ns in times]
+    assert many.many([parts[0][0]], [parts[0][1]]) == [one.at(times[0])]

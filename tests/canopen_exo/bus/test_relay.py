@@ -9,8 +9,8 @@ from canopen_exo.bus.frame import FLAG_EXTENDED, Frame
 from canopen_exo.bus.node import NEVER, ErrorState, Out, PortState, Relay
 from canopen_exo.bus.realtime import RealTimeLoop
 
-LOOKED_AT, DISTURBING, CALMING = 1, 2, 3
-"""Ids the node wants to see; the last two switch `is_disturbed` on and off."""
+LOOKED_AT = 1
+"""An id the node wants to see."""
 
 
 class FakeRecordChannel(RecordChannel):
@@ -76,14 +76,12 @@ class Diarist(Relay):
         self.wake_at = wake_at
         self.seen: list[tuple[int, int]] = []
         for table in self.passes:
-            table[:] = bytes(can_id not in (LOOKED_AT, DISTURBING, CALMING) for can_id in range(0x800))
+            table[:] = bytes(can_id != LOOKED_AT for can_id in range(0x800))
 
     def receive(self, now: int, port: int, frame: Frame, out: Out) -> None:
         self.frames[port] += 1
-        if self.is_disturbed or frame.can_id in (LOOKED_AT, DISTURBING, CALMING) or frame.flags:
+        if self.is_disturbed or frame.can_id == LOOKED_AT or frame.flags:
             self.seen.append((now, frame.can_id))
-        if frame.can_id in (DISTURBING, CALMING):
-            self.is_disturbed = frame.can_id == DISTURBING
         out.send(1 - port, frame)
 
     def wake(self, now: int, out: Out) -> None:
@@ -92,12 +90,15 @@ class Diarist(Relay):
 
     def port_changed(self, now: int, state: PortState, out: Out) -> None:
         self.seen.append((now, -2 - state.port))
+        self.is_disturbed = state.state is ErrorState.BUS_OFF
 
 
 things = st.one_of(
     st.builds(Frame, st.integers(0, 12), st.binary(max_size=8)),
     st.builds(Frame, st.integers(0, 12), st.binary(max_size=8), st.just(FLAG_EXTENDED)),
-    st.just(PortState(0, ErrorState.WARNING, 96, 0, "")),
+    st.builds(
+        PortState, st.just(0), st.sampled_from((ErrorState.WARNING, ErrorState.BUS_OFF)), *[st.just(0)] * 2, st.just("")
+    ),
 )
 plain_traffic = st.lists(
     st.tuples(st.integers(0, 1), st.integers(0, 9), st.builds(Frame, st.integers(0, 12), st.binary(max_size=8))),
@@ -165,12 +166,14 @@ def test_runs_of_records_are_served_as_frames_are(
     assert served(first, second, takes, False, NEVER) == served(first, second, takes, True, NEVER)
 
 
-def outcome(kinds: list[Frame], wake_at: int) -> tuple[int, int]:
+def outcome(kinds: list[Frame], wake_at: int, is_disturbed: bool = False) -> tuple[int, int]:
     """How many of those that come at 0, 1, ... ns go out on the other channel, and how many of them as records."""
     channels = [FakeRecordChannel(10, 100), FakeRecordChannel(11, 100)]
     channels[0].inbox = list(enumerate(kinds))
+    node = Diarist(wake_at)
+    node.is_disturbed = is_disturbed
     loop = RealTimeLoop(
-        Diarist(wake_at), list(channels), [0, 1], 0, clock=lambda: 12, wait=lambda readers, writers, _: (readers, writers)
+        node, list(channels), [0, 1], 0, clock=lambda: 12, wait=lambda readers, writers, _: (readers, writers)
     )
     turns = iter((False, True))
     loop.run(lambda _: next(turns))
@@ -188,15 +191,15 @@ def base(*ids: int) -> list[Frame]:
         (base(7), NEVER, 1),
         (base(LOOKED_AT), NEVER, 0),
         (base(7, LOOKED_AT, 7, 8), NEVER, 3),
-        (base(7, DISTURBING, 7, 8), NEVER, 1),  # from there on all are handled
         (base(7, 8), 1, 2),  # at one instant a frame comes before a wake-up
         (base(7, 8), 0, 0),  # a wake-up that is due between them
         ([*base(7), Frame(7, b"", FLAG_EXTENDED)], NEVER, 0),
     ],
 )
 def test_only_what_the_node_does_not_want_goes_as_a_record(kinds: list[Frame], wake_at: int, records: int) -> None:
-    """What is looked at, disturbed, of another kind or comes with a wake-up that is due is handled."""
+    """What is looked at, of another kind or comes with a wake-up that is due is handled; all, while disturbed."""
     assert outcome(kinds, wake_at) == (len(kinds), records)
+    assert outcome(kinds, wake_at, is_disturbed=True) == (len(kinds), 0)
 
 
 def test_a_table_that_changes_within_a_batch_is_followed() -> None:
