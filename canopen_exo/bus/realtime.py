@@ -201,9 +201,9 @@ class RealTimeLoop:
 
     def _prepare(self, now: int, latest: int, writers: list[int]) -> int:
         """Fill in what to wait for; returns until when, `latest` at most."""
-        at = latest
-        if self._node.wake_at < at:
-            at = self._node.wake_at
+        at = self._node.wake_at
+        if at > latest:
+            at = latest
         if self._out.echoes:
             at = now
         for line in self._lines:

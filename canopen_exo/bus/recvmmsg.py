@@ -31,9 +31,6 @@ _PLAIN_SIZE: Final = 16
 _LENGTH_AT: Final = 4
 """linux/can.h: of the data length in both."""
 
-_WORD: Final = 4
-_ID: Final = struct.Struct("=I")
-
 _CONTROL_SIZE: Final = 64
 """Bytes for control messages: a stamp (16 + 16) and a drop count (16 + 8), which comes only after a drop."""
 
@@ -42,12 +39,13 @@ _ALIGNED: Final = struct.calcsize("N")
 _TIME: Final = struct.Struct("@ll")  # timespec
 _COUNT: Final = struct.Struct("@I")
 _STAMP_SIZE: Final = _CONTROL_HEAD.size + _TIME.size
-_STAMP_AT: Final = _CONTROL_HEAD.size
-_FIRST_STAMP: Final = _TIME.unpack_from
-_FIRST_ID: Final = _ID.unpack_from
-_LONG: Final = struct.calcsize("l")
-_SECONDS_AT: Final = _STAMP_AT // _LONG
-_STEP: Final = _CONTROL_SIZE // _LONG
+_PLACE_SIZE: Final = RECORD_SIZE + _CONTROL_SIZE
+"""Where one message is read to: its record, its control messages behind it."""
+
+_FIRST: Final = struct.Struct(f"@IB{RECORD_SIZE - _LENGTH_AT - 1}x{_CONTROL_HEAD.size}xll").unpack_from
+_WORDS: Final = _PLACE_SIZE // struct.calcsize("I")
+_LONGS: Final = _PLACE_SIZE // struct.calcsize("l")
+_SECONDS_AT: Final = (RECORD_SIZE + _CONTROL_HEAD.size) // struct.calcsize("l")
 _SECOND: Final = 1_000_000_000
 
 _MISSING: Final = (errno.ENOSYS, errno.EPERM)
@@ -93,9 +91,8 @@ class Receiver:
     """Reads from sockets that stamp what comes (SO_TIMESTAMPNS) and count what they drop (SO_RXQ_OVFL).
 
     count: records of the last `read`. is_plain: all of them are classical (16 bytes), stamped, and told of no drop;
-    `record`, `seconds` and `nanos` have them then, `stamped`
-    in any case. views: their bytes; outgoing: where they stand
-    for sendmmsg. drops: the running total last told, -1 for none.
+    `record`, `ids`, `seconds` and `nanos` have them then, `stamped` in any case. views: of each plain record; outgoing:
+    the same for sendmmsg. drops: the running total last told, -1 for none.
     is_untold: with a record that was not plain there was more to tell, of drops, than there was room for.
     """
 
@@ -108,12 +105,11 @@ class Receiver:
         self._read_many: Callable[[], int] | None = None
         self._found: list[Stamped] = []  # of records that are not plain
         self._error: OSError | None = None
-        self._records: Final[bytearray] = bytearray(SLOTS * RECORD_SIZE)
-        self._controls: Final[bytearray] = bytearray(SLOTS * _CONTROL_SIZE)
-        self._words: Final = memoryview(self._records).cast("I")
-        self._longs: Final = memoryview(self._controls).cast("l")
+        self._places: Final[bytearray] = bytearray(SLOTS * _PLACE_SIZE)
+        self._words: Final = memoryview(self._places).cast("I")
+        self._longs: Final = memoryview(self._places).cast("l")
         self.views: Final = [
-            memoryview(self._records)[at : at + _PLAIN_SIZE] for at in range(0, SLOTS * RECORD_SIZE, RECORD_SIZE)
+            memoryview(self._places)[at : at + _PLAIN_SIZE] for at in range(0, SLOTS * _PLACE_SIZE, _PLACE_SIZE)
         ]
         self._slots: Final = (_Slot * SLOTS)()
         self._vectors: Final = (_Vector * SLOTS)()
@@ -160,17 +156,15 @@ class Receiver:
 
     def first(self) -> tuple[int, int, int, int]:
         """Of the first of plain records: id, data length, and its stamp, seconds and nanoseconds of CLOCK_REALTIME."""
-        seconds, nanos = _FIRST_STAMP(self._controls, _STAMP_AT)
-        return _FIRST_ID(self._records)[0], self._records[_LENGTH_AT], seconds, nanos
+        return _FIRST(self._places)
 
     def ids(self) -> list[int]:
         """The first word of every plain record: id and flags."""
-        step = RECORD_SIZE // _WORD
-        return self._words[: self.count * step : step].tolist()
+        return self._words[: self.count * _WORDS : _WORDS].tolist()
 
     def longest(self) -> int:
         """The largest data length that a plain record claims to have."""
-        return max(self._records[_LENGTH_AT : self.count * RECORD_SIZE : RECORD_SIZE])
+        return max(self._places[_LENGTH_AT : self.count * _PLACE_SIZE : _PLACE_SIZE])
 
     def record(self, number: int) -> bytes:
         """One of the plain records."""
@@ -178,11 +172,11 @@ class Receiver:
 
     def seconds(self) -> list[int]:
         """Of the stamps of the plain records, on CLOCK_REALTIME."""
-        return self._longs[_SECONDS_AT : self.count * _STEP : _STEP].tolist()
+        return self._longs[_SECONDS_AT : self.count * _LONGS : _LONGS].tolist()
 
     def nanos(self) -> list[int]:
         """The rest of these stamps."""
-        return self._longs[_SECONDS_AT + 1 : self.count * _STEP : _STEP].tolist()
+        return self._longs[_SECONDS_AT + 1 : self.count * _LONGS : _LONGS].tolist()
 
     def stamped(self) -> list[Stamped]:
         """All records of the last `read`, of whatever size."""
@@ -195,16 +189,15 @@ class Receiver:
 
     def _lay_out(self) -> bytes:
         """Point every slot at its place; the heads as they have to be before a call."""
-        records = (ctypes.c_char * len(self._records)).from_buffer(self._records)
-        controls = (ctypes.c_char * len(self._controls)).from_buffer(self._controls)
+        places = (ctypes.c_char * len(self._places)).from_buffer(self._places)
         for number in range(SLOTS):
             vector = self._vectors[number]
-            vector.base = ctypes.addressof(records) + number * RECORD_SIZE
+            vector.base = ctypes.addressof(places) + number * _PLACE_SIZE
             vector.size = RECORD_SIZE
             message = self._slots[number].message
             message.vectors = ctypes.addressof(vector)
             message.vector_count = 1
-            message.control = ctypes.addressof(controls) + number * _CONTROL_SIZE
+            message.control = vector.base + RECORD_SIZE
             message.control_size = _CONTROL_SIZE
         return bytes(self._slots)
 
@@ -226,10 +219,11 @@ class Receiver:
             slot = _Slot.from_buffer_copy(heads, number * _SLOT_SIZE)
             if slot.message.flags & socket.MSG_CTRUNC:
                 self.is_untold = True
-            at = number * _CONTROL_SIZE
-            stamp = self._controls_in(self._controls[at : at + min(slot.message.control_size, _CONTROL_SIZE)])
-            at = number * RECORD_SIZE
-            self._found.append((stamp, bytes(self._records[at : at + slot.size])))
+            at = number * _PLACE_SIZE
+            controls_at = at + RECORD_SIZE
+            size = min(slot.message.control_size, _CONTROL_SIZE)
+            stamp = self._controls_in(self._places[controls_at : controls_at + size])
+            self._found.append((stamp, bytes(self._places[at : at + slot.size])))
 
     def _controls_in(self, controls: bytes | bytearray) -> int:
         """Note the drops told in these control messages (cmsg(3)); the stamp."""
@@ -321,7 +315,7 @@ def _beginnings(heads: bytes) -> list[bytes]:
 
 
 def find_call(name: str) -> Callable[..., int] | None:
-    """A function of the C library, which is not to wait and so keeps the interpreter's lock; None where there is none."""
+    """A function of the C library, None where it is not; it is not to wait, so it keeps the interpreter's lock."""
     if sys.platform != "linux":
         return None
     return getattr(ctypes.PyDLL(None, use_errno=True), name, None)

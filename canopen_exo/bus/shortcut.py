@@ -39,6 +39,7 @@ class ShortCut:
         self._relay: Final[Relay] = relay
         self._channels: Final[list[RecordChannel]] = channels
         self._lines: Final[list[Line]] = lines
+        self._ways: Final = [(place, lines[place], channels[place]) for place in _PLACES]
         self._out: Final[RealTimeOut] = out
         self._deliver: Final = deliver
         self._clock: Final = clock
@@ -50,9 +51,8 @@ class ShortCut:
         at, ends = self._at, self._ends
         at[0] = at[1] = 0
         is_plain = True
-        for place in _PLACES:
-            channel = self._channels[place]
-            if self._lines[place].fd in readable or channel.poll_at <= now:
+        for place, line, channel in self._ways:
+            if line.fd in readable or channel.poll_at <= now:
                 if not channel.read():
                     is_plain = False
                 ends[place] = channel.count

@@ -209,11 +209,20 @@ class SocketCanChannel(RecordChannel):
         if self._socket is None and not self._is_closed:
             self._reopen(now)
         if self._socket is not None:
+            receiver = self._receiver
             try:
-                count = self._receiver.read()
-                if self._receiver.is_plain and not self._is_down and not self._notices and self._is_base(count):
-                    self.count = count
-                    return True
+                count = receiver.read()
+                if receiver.is_plain and not self._is_down and not self._notices:
+                    if count == 1:  # a frame alone, what a bus that is not crowded gives, waits for this
+                        can_id, length, seconds, nanos = receiver.first()
+                        if can_id <= 0x7FF and length <= 8:
+                            self.ids = [can_id]
+                            self.stamps = [self._stamps.at(seconds * SECOND + nanos)]
+                            self.count = 1
+                            return True
+                    elif self._take_base():
+                        self.count = count
+                        return True
                 self._take_all(now)
             except BlockingIOError:
                 pass
@@ -239,7 +248,7 @@ class SocketCanChannel(RecordChannel):
             return 0
         if end - start > 1:
             return self._sender.send(source._receiver, start, end)
-        try:  # a frame alone, what a bus that is not crowded gives, waits for this
+        try:
             can.send(source._receiver.views[start])
         except OSError:
             return 0
@@ -294,16 +303,9 @@ class SocketCanChannel(RecordChannel):
         self._sender.attach(can)
         self._fd = can.fileno()
 
-    def _is_base(self, count: int) -> bool:
-        """Whether plain records are base data frames, as nearly all are; then `ids` and `stamps` tell of them."""
+    def _take_base(self) -> bool:
+        """Plain records that are base data frames, as nearly all are; False for any other."""
         receiver = self._receiver
-        if count == 1:
-            can_id, length, seconds, nanos = receiver.first()
-            if can_id > 0x7FF or length > 8:
-                return False
-            self.ids = [can_id]
-            self.stamps = [self._stamps.at(seconds * SECOND + nanos)]
-            return True
         ids = receiver.ids()
         if max(ids) > 0x7FF or receiver.longest() > 8:
             return False
