@@ -13,6 +13,9 @@ _BINS: Final = 8 * 58 + 16
 
 _TOP_NS: Final = (1 << 62) - 1
 
+_FEW: Final = 12
+"""Fewer delays than these are counted one by one."""
+
 
 class LatenessDocument(TypedDict):
     """As in JSON. bins: pairs of lower edge [ns] and count, the empty ones left out; percentiles in ns."""
@@ -47,12 +50,16 @@ class Lateness:
             self._bins[_bin(delay_ns if delay_ns > 0 else 0)] += 1
 
     def add_since(self, times: list[int], now: int) -> None:
-        """Count the delays of these times, in ascending order, until `now`: bin by bin, from the shortest."""
+        """Count the delays of these times, in ascending order, until `now`."""
         left = len(times)
+        if left < _FEW:
+            for time_ns in times:
+                self.add(now - time_ns)
+            return
         self.count += left
-        if left and now - times[0] > self.worst_ns:
+        if now - times[0] > self.worst_ns:
             self.worst_ns = now - times[0]
-        while left:
+        while left:  # bin by bin, from the shortest
             index = _bin(max(now - times[left - 1], 0))
             first = bisect_right(times, now - _lower(index + 1), 0, left)
             self._bins[index] += left - first

@@ -131,7 +131,7 @@ class Receiver:
         self.drops = -1
         self._socket = can
         self._error = None
-        call = find_call("recvmmsg")
+        call = find_call("recvmmsg", True)
         # all arguments made beforehand: converting them costs as much as the call
         many = None if call is None else partial(call, can.fileno(), self._slots_at, SLOTS, _NOW, None)
         self._read_many = many
@@ -287,7 +287,7 @@ class Sender:
 
     def attach(self, can: socket.socket) -> None:
         """Send on this socket from now on. One of a class of its own may have its own way of sending, so none there."""
-        call = find_call("sendmmsg") if type(can) is socket.socket else None
+        call = find_call("sendmmsg", False) if type(can) is socket.socket else None
         self._send_many = None if call is None else partial(call, can.fileno())
 
     def send(self, source: Receiver, start: int, end: int) -> int:
@@ -314,8 +314,11 @@ def _beginnings(heads: bytes) -> list[bytes]:
     return [heads[: number * _SLOT_SIZE] for number in range(SLOTS + 1)]
 
 
-def find_call(name: str) -> Callable[..., int] | None:
-    """A function of the C library, None where it is not; it is not to wait, so it keeps the interpreter's lock."""
+def find_call(name: str, tells_why: bool) -> Callable[..., int] | None:
+    """A function of the C library, None where it is not; it is not to wait, so it keeps the interpreter's lock.
+
+    tells_why: it leaves its error for `ctypes.get_errno`.
+    """
     if sys.platform != "linux":
         return None
-    return getattr(ctypes.PyDLL(None, use_errno=True), name, None)
+    return getattr(ctypes.PyDLL(None, use_errno=tells_why), name, None)

@@ -91,33 +91,35 @@ class ShortCut:
 
     def _serve_runs(self) -> None:
         """Base data frames alone, until all are served or something is in the way."""
-        at, ends, relay, channels, lines = self._at, self._ends, self._relay, self._channels, self._lines
-        latest = max([channels[place].stamps[-1] for place in _PLACES if ends[place]], default=-NEVER)
-        tables: list[bytearray] = []
-        passing = [b"", b""]
-        stops = [0, 0]
-        while at != ends:
-            if relay.is_disturbed or relay.wake_at < latest or lines[0].waiting or lines[1].waiting:
+        at, ends = self._at, self._ends
+        tables = list(self._relay.passes)
+        latest = -NEVER
+        stops: list[tuple[int, int, int]] = []  # stamp, place and number of those that do not only pass
+        for place, _, channel in self._ways:
+            if ends[place]:
+                table, stamps = tables[place], channel.stamps
+                if stamps[-1] > latest:
+                    latest = stamps[-1]
+                stops += [(stamps[number], place, number) for number, one in enumerate(channel.ids) if not table[one]]
+        if ends[0] and ends[1]:
+            stops.sort()
+        for stamp, place, number in stops:
+            if not self._is_free(latest, tables) or (at[place] < number and not self._pass_on(place, number)):
                 return
-            if tables != relay.passes:
-                tables = list(relay.passes)
-                for place in _PLACES:
-                    passing[place] = bytes([tables[place][can_id] for can_id in channels[place].ids[: ends[place]]])
-                    stops[place] = _stop(passing[place], at[place])
-            for place in _PLACES:
-                if at[place] < stops[place] and not self._pass_on(place, stops[place]):
-                    return
-            if at == ends:
-                break
-            place = 0  # the earlier one of two that stop
-            if at[0] == ends[0] or (at[1] < ends[1] and channels[1].stamps[at[1]] < channels[0].stamps[at[0]]):
-                place = 1
-            arrival = channels[place].arrival(at[place])
-            at[place] += 1
-            stops[place] = _stop(passing[place], at[place])
-            self._deliver(lines[place], arrival, arrival.stamp_ns)
+            at[place] = number + 1
+            self._deliver(self._lines[place], self._channels[place].arrival(number), stamp)
+        for place in _PLACES:
+            if at[place] < ends[place] and not (self._is_free(latest, tables) and self._pass_on(place, ends[place])):
+                return
         if latest > self._out.served_ns:
             self._out.served_ns = latest
+
+    def _is_free(self, latest: int, tables: list[bytearray]) -> bool:
+        """Whether nothing is in the way of frames up to the stamp `latest`, and what passes is what passed before."""
+        relay, lines = self._relay, self._lines
+        if relay.is_disturbed or relay.wake_at < latest or relay.passes != tables:
+            return False
+        return not (lines[0].waiting or lines[1].waiting)
 
     def _pass_on(self, place: int, limit: int) -> bool:
         """Send what came on a channel up to `limit` on the other one; False when that did not take all of it."""
@@ -129,9 +131,3 @@ class ShortCut:
         if self._clock is not None:
             self._lines[1 - place].latency.add_since(source.stamps[start:end], self._clock())
         return end == limit
-
-
-def _stop(passing: bytes, start: int) -> int:
-    """Up to where all pass. passing: by frame, 1 where it only passes."""
-    number = passing.find(0, start)
-    return number if number >= 0 else len(passing)

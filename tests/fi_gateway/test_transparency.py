@@ -263,7 +263,7 @@ def stalled(made: Bench) -> Iterator[Stalled]:
 @pytest.fixture
 def readable_by_python(monkeypatch: pytest.MonkeyPatch) -> None:
     """A socket of our own class is not read by the kernel's recvmmsg."""
-    monkeypatch.setattr(recvmmsg, "find_call", lambda name: None)
+    monkeypatch.setattr(recvmmsg, "find_call", lambda *_: None)
 
 
 def test_frames_that_wait_for_a_busy_interface_keep_their_order(bench: MakeBench, readable_by_python: None) -> None:
@@ -318,7 +318,7 @@ def test_an_interface_that_goes_away_and_comes_back_is_survived(
     bench: MakeBench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """ENODEV: reported, opened again with back-off; the gateway resumes without being told."""
-    monkeypatch.setattr(recvmmsg, "find_call", lambda name: None)  # what a socket of our own can play is recvmsg
+    monkeypatch.setattr(recvmmsg, "find_call", lambda *_: None)  # what a socket of our own can play is recvmsg
 
     class Gone(socket.socket):
         """A socket whose interface has been pulled out."""

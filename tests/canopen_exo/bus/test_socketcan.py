@@ -205,7 +205,7 @@ class ScriptedSocket(socket.socket):
 @pytest.fixture
 def scripted(monkeypatch: pytest.MonkeyPatch) -> Iterator[Wire]:
     """Read by recvmsg, for which a ScriptedSocket can stand in."""
-    monkeypatch.setattr(recvmmsg, "find_call", lambda name: None)
+    monkeypatch.setattr(recvmmsg, "find_call", lambda *_: None)
     wire = Wire()
     yield wire
     wire.close()
@@ -215,7 +215,7 @@ def scripted(monkeypatch: pytest.MonkeyPatch) -> Iterator[Wire]:
 def wire(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[Wire]:
     """Both ways to read."""
     if request.param == "recvmsg":
-        monkeypatch.setattr(recvmmsg, "find_call", lambda name: None)
+        monkeypatch.setattr(recvmmsg, "find_call", lambda *_: None)
     wire = Wire()
     yield wire
     wire.close()
