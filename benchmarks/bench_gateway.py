@@ -2,7 +2,8 @@
 
 Both forward the same frames (`forwarders`), in turn, in every round; each figure is the median of the rounds, each
 ratio the median of the rounds' ratios with its quartiles, so that what the machine does to both at a time does not
-count. Beside them stands the least that a Python program can do (select, recv, send): the floor. On a vcan (of this
+count. Beside them stand the least that a Python program can do (select, recv, send), which is the floor, and the
+gateway that takes a core of its own (`--busy-poll`). On a vcan (of this
 kernel, or of User Mode Linux) the kernel's own forwarding, cangw, is measured with them; `--vcan vcan0,vcan1` names the
 interfaces.
 
@@ -42,6 +43,7 @@ from pathlib import Path
 from typing import Final
 
 from benchmarks.forwarders import (
+    AWAKE_GATEWAY,
     BARE,
     BRIDGE,
     CANGW,
@@ -394,7 +396,7 @@ def main() -> int:
     interfaces = options.vcan.split(",") if options.vcan else []
     where = f"SocketCAN {options.vcan}" if interfaces else "UDP sockets in the place of AF_CAN"
     if not options.full_bus_only:
-        programs = [GATEWAY, BRIDGE, BARE]
+        programs = [GATEWAY, BRIDGE, BARE, AWAKE_GATEWAY]
         if interfaces and shutil.which(CANGW):
             programs.append(CANGW)
         print(f"gateway with one active rule, {where}, median of {options.rounds} rounds", flush=True)

@@ -50,6 +50,8 @@ WALKING: Final = struct.pack("<BHH", STATUS_MOTION, 0, 0)
 """What the controller says at time 0: then the gateway knows it, as in every motion."""
 
 GATEWAY: Final = "gateway"
+AWAKE_GATEWAY: Final = "--busy-poll"
+"""Ours with that option."""
 BUSY_GATEWAY: Final = "gateway-on-busy-buses"
 """For the soak: its sockets refuse again and again, as those of busy interfaces do."""
 BRIDGE: Final = "can_bridge"
@@ -115,12 +117,17 @@ def serve_busy_gateway(ends: list[str]) -> None:
     print(json.dumps({**account, "refusals": busy[0].refusals + busy[1].refusals}))
 
 
-def serve_gateway(ends: list[str]) -> None:
+def serve_gateway(ends: list[str], busy_poll: bool = False) -> None:
     """Our gateway."""
-    print(json.dumps(served([lambda: near_socket(ends[0]), lambda: near_socket(ends[1])])))
+    print(json.dumps(served([lambda: near_socket(ends[0]), lambda: near_socket(ends[1])], busy_poll)))
 
 
-def served(openers: list[Callable[[], socket.socket]]) -> dict[str, object]:
+def serve_awake_gateway(ends: list[str]) -> None:
+    """Our gateway with `--busy-poll`."""
+    serve_gateway(ends, busy_poll=True)
+
+
+def served(openers: list[Callable[[], socket.socket]], busy_poll: bool = False) -> dict[str, object]:
     """Our gateway until SIGTERM; then its own account of it."""
     stopped = False
 
@@ -135,7 +142,7 @@ def served(openers: list[Callable[[], socket.socket]]) -> dict[str, object]:
         channel.epoch_ns = epoch_ns
         channel.receive()  # probes from before this process was ready would spoil the worst latency
     gateway = Gateway([rule()], 2_000_000)
-    loop = RealTimeLoop(gateway, list(channels), [0, 1], epoch_ns, measure_latency=True)
+    loop = RealTimeLoop(gateway, list(channels), [0, 1], epoch_ns, measure_latency=True, busy_poll=busy_poll)
     loop.run(lambda now: stopped)
     latency = loop.latency[0]
     latency.merge(loop.latency[1])
@@ -189,7 +196,13 @@ def serve_bare(ends: list[str]) -> None:
                 pass
 
 
-SERVE: Final = {GATEWAY: serve_gateway, BUSY_GATEWAY: serve_busy_gateway, BRIDGE: serve_bridge, BARE: serve_bare}
+SERVE: Final = {
+    GATEWAY: serve_gateway,
+    AWAKE_GATEWAY: serve_awake_gateway,
+    BUSY_GATEWAY: serve_busy_gateway,
+    BRIDGE: serve_bridge,
+    BARE: serve_bare,
+}
 
 
 # --- what is connected to both buses -------------------------------------------------------------------------------
