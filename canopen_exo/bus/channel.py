@@ -104,7 +104,8 @@ class StampClock:
     """Stamps of CLOCK_REALTIME (the kernel's, python-can's) on the loop's clock.
 
     Both clocks are compared anew for every batch, at most once a millisecond, so a corrected wall clock does no harm: a
-    stamp lies between the one before it and now, whatever the wall clock did meanwhile.
+    stamp lies between the one before it and now, whatever the wall clock did meanwhile. `begin` comes after the
+    reading: what arrives between the two, while the process is held up, would count as earlier than it was sent.
     now: of the last `begin`; offset: what to take from a stamp, ns; last: the stamp given last. A channel that reads
     many stamps at once does what `at` does by itself.
     """

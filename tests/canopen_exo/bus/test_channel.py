@@ -5,32 +5,15 @@ import pytest
 from canopen_exo.bus import channel
 from canopen_exo.bus.channel import StampClock
 from canopen_exo.bus.node import MS, SECOND
+from tests.stamps import FakeTime
 
 EPOCH = 1000 * SECOND
-WALL = 1_700_000_000 * SECOND
-
-
-class FakeTime:
-    """Both clocks of the machine, ns."""
-
-    def __init__(self) -> None:
-        self.monotonic = EPOCH + 5 * SECOND
-        self.wall = WALL
-
-    def monotonic_ns(self) -> int:
-        return self.monotonic
-
-    def time_ns(self) -> int:
-        return self.wall
-
-    def pass_by(self, span_ns: int) -> None:
-        self.monotonic += span_ns
-        self.wall += span_ns
+WALL = FakeTime().wall
 
 
 @pytest.fixture
 def clocks(monkeypatch: pytest.MonkeyPatch) -> FakeTime:
-    fake = FakeTime()
+    fake = FakeTime(EPOCH + 5 * SECOND)
     monkeypatch.setattr(channel, "time", fake)
     return fake
 
