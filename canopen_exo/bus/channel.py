@@ -17,7 +17,8 @@ from canopen_exo.bus.node import MS, NEVER, PortState
 
 _COMPARISONS: Final = 5
 _COMPARED_WITHIN_NS: Final = 5_000
-"""A process that is interrupted between two clocks compares them again, four times at most; the closest counts."""
+"""A process that is interrupted between two clocks compares them again, four times at most; the closest counts. Where
+reading a clock takes longer than this, twice the closest so far will do."""
 
 _COMPARED_FOR_NS: Final = MS
 """How long a comparison holds: a wall clock that is being slewed drifts by 0.5 us in it (500 ppm, adjtimex(2))."""
@@ -116,6 +117,7 @@ class StampClock:
         self.last: int = -NEVER
         self._epoch_ns: int = 0
         self._compare_at: int = -NEVER
+        self._closest_ns: int = 0
 
     def begin(self, epoch_ns: int) -> int:
         """Compare the clocks when it is time to; returns now on the loop's clock [ns]."""
@@ -135,8 +137,10 @@ class StampClock:
             if after - before < tightest:
                 tightest = after - before
                 self.offset = wall - (before + after) // 2 + epoch_ns
-            if tightest < _COMPARED_WITHIN_NS:
+            if tightest < _COMPARED_WITHIN_NS or tightest <= 2 * self._closest_ns:
                 break
+        if self._closest_ns == 0 or tightest < self._closest_ns:
+            self._closest_ns = tightest
         self._epoch_ns = epoch_ns
         self._compare_at = after + _COMPARED_FOR_NS
         return after

@@ -51,3 +51,43 @@ def test_corrected_wall_clock_is_followed(clocks: FakeTime) -> None:
     clocks.wall += 7 * SECOND
     stamps.begin(EPOCH)
     assert stamps.at(clocks.wall - MS) == 5 * SECOND + 9 * MS
+
+
+class SlowTime(FakeTime):
+    """Reading a clock takes `cost_ns`; `interrupted`: the process is held up so often, 10 ms, between two clocks."""
+
+    def __init__(self, cost_ns: int) -> None:
+        super().__init__(EPOCH)
+        self.cost_ns = cost_ns
+        self.comparisons = 0
+        self.interrupted = 0
+
+    def monotonic_ns(self) -> int:
+        self.pass_by(self.cost_ns)
+        return super().monotonic_ns()
+
+    def time_ns(self) -> int:
+        self.comparisons += 1
+        if self.interrupted:
+            self.interrupted -= 1
+            self.pass_by(10 * MS)
+        return super().time_ns()
+
+
+@pytest.mark.parametrize(("cost_ns", "first"), [(1_000, 1), (50_000, 5)])
+def test_clocks_are_compared_again_only_after_an_interruption(
+    monkeypatch: pytest.MonkeyPatch, cost_ns: int, first: int
+) -> None:
+    """Five times at most; how close two readings can come is learned with the first stamps."""
+    clocks = SlowTime(cost_ns)
+    monkeypatch.setattr(channel, "time", clocks)
+    stamps = StampClock()
+    counts = []
+    for interrupted in (0, 0, 2, 0, 9):
+        clocks.pass_by(2 * MS)
+        clocks.comparisons, clocks.interrupted = 0, interrupted
+        stamps.begin(EPOCH)
+        counts.append(clocks.comparisons)
+        if interrupted < 5:
+            assert abs(stamps.at(clocks.wall) - (clocks.monotonic - EPOCH)) <= cost_ns
+    assert counts == [first, 1, 3, 1, 5]
