@@ -21,7 +21,7 @@ from testbench.errors import BenchError
 from testbench.merge import IncompleteError, add_reasons, merge, time_zero_of
 from testbench.parts import PartError, read_gateway, read_hlc, read_joints
 from testbench.record import RunRecord
-from testbench.run import CHUNK_NS, LEAVE_NS, START_NS, Progress, Result
+from testbench.run import CHUNK_NS, LEAVE_NS, START_NS, Progress, Result, judge_pair
 from testbench.scenario import Scenario
 from testbench.summary import RealTimeEntry, RealTimeRunEntry, summary_document
 from testbench.supervisor import Setup, Supervisor, check_status_readers
@@ -73,16 +73,7 @@ def run_realtime(
             golden, faulted = _run_pair(setup, progress, announce, host.processes["hub"])
     else:
         golden, faulted = _run_pair(setup, progress, announce, None)
-    names = tuple(joint.name for joint in scenario.plan.joints)
-    judgement = judge(
-        names,
-        {name: limits_of(name) for name in names},
-        golden.record,
-        faulted.record,
-        tolerance_rad=scenario.tolerance_rad,
-        fail_on=scenario.fail_on,
-        expectations=scenario.expect,
-    )
+    judgement = judge_pair(scenario, golden.record, faulted.record)
     document = summary_document(
         scenario.name,
         scenario.seed,
