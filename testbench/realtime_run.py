@@ -17,13 +17,14 @@ from fi_gateway.control_socket import ask_listing
 from fi_gateway.errors import FaultError
 from hlc.limits import limits_of
 from testbench.child import Process, ProcessError
+from testbench.document import RealTimeEntry, RealTimeRunEntry
 from testbench.errors import BenchError
 from testbench.merge import IncompleteError, add_reasons, merge, time_zero_of
 from testbench.parts import PartError, read_gateway, read_hlc, read_joints
 from testbench.record import RunRecord
 from testbench.run import CHUNK_NS, LEAVE_NS, START_NS, Progress, Result, judge_pair
 from testbench.scenario import Scenario
-from testbench.summary import RealTimeEntry, RealTimeRunEntry, summary_document
+from testbench.summary import summary_document
 from testbench.supervisor import Setup, Supervisor, check_status_readers
 from testbench.timing import Timing, TimingLimits, judge_timing
 from testbench.verdict import judge

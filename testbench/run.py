@@ -20,11 +20,12 @@ from fi_gateway.replay import Window
 from fi_gateway.schema import build_injectors
 from hlc.limits import limits_of
 from hlc.node import HighLevelController, Phase
+from testbench.document import Summary
 from testbench.errors import BenchError
 from testbench.record import BusStats, Commands, RigEvent, RunRecord, Truth
 from testbench.rig import Rig, RigParams, build_rig
 from testbench.scenario import Scenario
-from testbench.summary import Summary, summary_document
+from testbench.summary import summary_document
 from testbench.verdict import Judgement, judge
 
 CHUNK_NS: Final = 50 * MS
