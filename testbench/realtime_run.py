@@ -15,7 +15,6 @@ from typing import Final, TypeVar
 from canopen_exo.bus.node import NEVER, SECOND
 from fi_gateway.control_socket import ask_listing
 from fi_gateway.errors import FaultError
-from hlc.limits import limits_of
 from testbench.child import Process, ProcessError
 from testbench.document import RealTimeEntry, RealTimeRunEntry
 from testbench.errors import BenchError
@@ -27,7 +26,6 @@ from testbench.scenario import Scenario
 from testbench.summary import summary_document
 from testbench.supervisor import Setup, Supervisor, check_status_readers
 from testbench.timing import Timing, TimingLimits, judge_timing
-from testbench.verdict import judge
 
 TAIL_NS: Final = SECOND // 2
 """How long a rig without our controller is listened to after the motion."""
