@@ -120,7 +120,7 @@ def _run(options: argparse.Namespace) -> int:
     from fi_gateway.marked_yaml import FileErrors
     from fi_gateway.schema import refuse_wire_faults
     from testbench.errors import BenchError
-    from testbench.store import check_folder, default_folder, result_files, write_result
+    from testbench.store import check_folder, default_folder
     from testbench.summary import summary_json, summary_text
 
     try:
@@ -141,9 +141,8 @@ def _run(options: argparse.Namespace) -> int:
         _say(f"warning: {warning}")
 
     from canopen_exo.errors import CanopenExoError
-    from hlc.limits import limits_of
     from joint_emulators.errors import JointEmulatorError
-    from testbench.report import Plotted, plot_files
+    from testbench.folder import write_folder
 
     try:
         with _progress(scenario.name) as progress:
@@ -164,15 +163,8 @@ def _run(options: argparse.Namespace) -> int:
         return INVALID
     if replay is not None:
         result.document["replay"] = replay.entry(result.document)
-    names = tuple(joint.name for joint in scenario.plan.joints)
-    limits = {name: limits_of(name) for name in names}
-    title = f"{scenario.name}, seed {scenario.seed}"
-    files = result_files(scenario.resolved_yaml(), result.document, names, result.golden, result.faulted)
-    triggers = {name: spec.trigger for name, spec in scenario.injectors.items() if spec.trigger is not None}
-    shown = Plotted(title, names, limits, result.golden, result.faulted, result.judgement, triggers)
-    files.update(plot_files(shown))
     try:
-        written = write_result(folder, files)
+        written = write_folder(folder, result)
     except BenchError as error:
         _say(str(error))
         return USAGE

@@ -70,8 +70,31 @@ def run_scenario(
     golden, golden_ns = run_rig(params, [], lambda share: progress(0.5 * share))
     injectors = build_injectors(scenario.injectors, params.plan, scenario.seed, 0, recorded)
     faulted, faulted_ns = run_rig(params, injectors, lambda share: progress(0.5 + 0.5 * share))
-    names = tuple(joint.name for joint in params.plan.joints)
-    judgement = judge(
+    wall_time_s = time.perf_counter() - started
+    return result_of(scenario, golden, faulted, sim_time_s=(golden_ns + faulted_ns) / 1e9, wall_time_s=wall_time_s)
+
+
+def result_of(
+    scenario: Scenario, golden: RunRecord, faulted: RunRecord, *, sim_time_s: float, wall_time_s: float
+) -> Result:
+    """The pair of runs judged, and what is said about it. sim_time_s, wall_time_s: of the runs made for it."""
+    judgement = judge_pair(scenario, golden, faulted)
+    document = summary_document(
+        scenario.name,
+        scenario.seed,
+        golden,
+        faulted,
+        judgement,
+        sim_time_s=sim_time_s,
+        wall_time_s=wall_time_s,
+    )
+    return Result(scenario, golden, faulted, judgement, document)
+
+
+def judge_pair(scenario: Scenario, golden: RunRecord, faulted: RunRecord) -> Judgement:
+    """As the scenario wants it judged, by the table's limits of its joints."""
+    names = tuple(joint.name for joint in scenario.plan.joints)
+    return judge(
         names,
         {name: limits_of(name) for name in names},
         golden,
@@ -80,16 +103,6 @@ def run_scenario(
         fail_on=scenario.fail_on,
         expectations=scenario.expect,
     )
-    document = summary_document(
-        scenario.name,
-        scenario.seed,
-        golden,
-        faulted,
-        judgement,
-        sim_time_s=(golden_ns + faulted_ns) / 1e9,
-        wall_time_s=time.perf_counter() - started,
-    )
-    return Result(scenario, golden, faulted, judgement, document)
 
 
 def rig_params(scenario: Scenario) -> RigParams:
