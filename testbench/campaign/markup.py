@@ -5,7 +5,7 @@ Names of scenarios, injectors and axes come from users' files and may hold anyth
 
 from collections.abc import Collection, Iterable, Sequence
 from html import escape
-from typing import Final
+from typing import Final, TypeAlias
 
 _EMPTY: Final = frozenset({"meta", "br", "col"})
 
@@ -16,7 +16,7 @@ class Html(str):
     __slots__ = ()
 
 
-Content = str | Iterable[str]
+Content: TypeAlias = "str | Iterable[Content]"
 """A text, a piece of HTML, or several of them."""
 
 

@@ -4,15 +4,14 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from testbench.campaign.meta import Axis
-from testbench.campaign.records import FAILURES, NO_STATEMENT, Outcome, Point, RunRow
+from testbench.campaign.axes import Axis
+from testbench.campaign.records import FAILURES, NO_STATEMENT, Point, RunRow
+from testbench.campaign.rule_specs import RUN_NUMBERS
+from testbench.campaign.rules import FAILURE, OUTCOMES, counts_as
 
-FAILURE: Final = "failure"
-"""Any of the failures."""
 EXCEEDED: Final = "exceeded"
 """Any limit exceeded: an error or a failure."""
 
-_OF_RUN: Final = ("beyond_deg", "beyond_s", "detection_latency_s", "first_start_s", "first_phase", "wall_s")
 _UNITS: Final = (("_rad_s", "rad/s"), ("_rad", "rad"), ("_nm", "N m"), ("_deg", "deg"), ("_rpm", "rpm"), ("_s", "s"))
 
 
@@ -44,19 +43,14 @@ def quantity(name: str) -> Quantity:
     return Quantity(name, f"{joint.replace('_', ' ')}, {words}" if dot else words, unit)
 
 
-def outcomes_named(name: str) -> frozenset[Outcome] | None:
-    """The outcomes a name stands for: `failure` for all failures; None when it names none."""
-    if name == FAILURE:
-        return FAILURES
-    try:
-        return frozenset({Outcome(name)})
-    except ValueError:
-        return None
+def is_share(name: str) -> bool:
+    """Whether a figure of that name shows a share of the runs: `failure`, or an outcome."""
+    return name in (FAILURE, *OUTCOMES)
 
 
 def value_of(row: RunRow, name: str) -> float | None:
     """The number of that name, None where this run has none."""
-    if name in _OF_RUN:
+    if name in RUN_NUMBERS:
         found = getattr(row, name)
         return None if found is None else float(found)
     return row.metrics.get(name)
@@ -73,13 +67,10 @@ def stating(rows: Iterable[RunRow]) -> list[RunRow]:
 
 
 def count(rows: Iterable[RunRow], what: str) -> int:
-    """How many runs came out as named: `failure`, `exceeded`, or an outcome. Raises KeyError for other names."""
+    """How many runs came out as named: `failure`, an outcome, or `exceeded`."""
     if what == EXCEEDED:
         return sum(row.errors > 0 or row.failures > 0 or row.outcome in FAILURES for row in rows)
-    named = outcomes_named(what)
-    if named is None:
-        raise KeyError(f"{what!r} is no outcome; allowed: failure, exceeded, {', '.join(one.value for one in Outcome)}")
-    return sum(row.outcome in named for row in rows)
+    return sum(counts_as(row.outcome, what) for row in rows)
 
 
 def by_point(rows: Iterable[RunRow], points: Sequence[Point]) -> dict[Point, list[RunRow]]:
@@ -92,10 +83,9 @@ def by_point(rows: Iterable[RunRow], points: Sequence[Point]) -> dict[Point, lis
 
 def number_at(point: Point, axis: Axis) -> float | None:
     """SI value of an axis at a point; None for a text, or where the point has no such axis."""
-    for name, text in point.parameters:
-        if name == axis.name:
-            return axis.values.get(text)
-    return None
+    text = dict(point.parameters).get(axis.name)
+    number = None if text is None else axis.number(text)
+    return None if number is None else number.value
 
 
 def words_of(point: Point) -> str:

@@ -9,6 +9,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
+from testbench.campaign.axes import Axis
 from testbench.campaign.figures import (
     Column,
     Curve,
@@ -22,14 +23,15 @@ from testbench.campaign.markup import Content, Html, table, tag
 from testbench.campaign.measured import (
     by_point,
     count,
+    is_share,
     number_at,
-    outcomes_named,
     quantity,
     stating,
     values_of,
 )
-from testbench.campaign.meta import Axis, FigureWanted, Meta
+from testbench.campaign.meta import Meta
 from testbench.campaign.records import RunRow
+from testbench.campaign.rules import Figure
 from testbench.campaign.samples import Summary, mean_interval, summary
 from testbench.campaign.sections import motion_note, number
 from testbench.campaign.statistics import Interval, NotEstimableError, wilson
@@ -48,7 +50,7 @@ _GOLDEN_RATIO: Final = 0.618034
 class Panel:
     """A figure wanted, for one combination of the other axes (`held`, in words), with its runs by rising x."""
 
-    wanted: FigureWanted
+    wanted: Figure
     axis: Axis
     held: str
     columns: tuple[tuple[float, tuple[RunRow, ...]], ...]
@@ -69,8 +71,8 @@ def panels(rows: Sequence[RunRow], meta: Meta) -> list[Panel]:
     return [panel for wanted in meta.figures for panel in _panels(stating(rows), meta, wanted)]
 
 
-def _panels(rows: Sequence[RunRow], meta: Meta, wanted: FigureWanted) -> Iterator[Panel]:
-    axis = meta.axis(wanted.x)
+def _panels(rows: Sequence[RunRow], meta: Meta, wanted: Figure) -> Iterator[Panel]:
+    (axis,) = (axis for axis in meta.axes if axis.name == wanted.x)
     inside: dict[tuple[tuple[str, str], ...], dict[float, list[RunRow]]] = {}
     for point, found in by_point(rows, meta.points).items():
         x = number_at(point, axis)
@@ -89,7 +91,7 @@ def _panels(rows: Sequence[RunRow], meta: Meta, wanted: FigureWanted) -> Iterato
         yield _panel(wanted, axis, ", ".join(f"{name} {text}" for name, text in held), columns)
 
 
-def _panel(wanted: FigureWanted, axis: Axis, held: str, columns: dict[float, list[RunRow]]) -> Panel:
+def _panel(wanted: Figure, axis: Axis, held: str, columns: dict[float, list[RunRow]]) -> Panel:
     return Panel(wanted, axis, held, tuple((x, tuple(columns[x])) for x in sorted(columns)))
 
 
@@ -105,7 +107,7 @@ def figure_section(rows: Sequence[RunRow], meta: Meta) -> tuple[Html | None, int
 def _figure(panel: Panel, k: int) -> Html | None:
     y = panel.wanted.y
     title = panel_title(panel)
-    if outcomes_named(y) is not None:
+    if is_share(y):
         shares = []
         for x, rows in panel.columns:
             if rows:
@@ -146,7 +148,7 @@ def _dots(panel: Panel) -> list[tuple[float, float]]:
 def panel_title(panel: Panel) -> str:
     """`right knee, position RMSE over duration, stops off`."""
     y = panel.wanted.y
-    named = f"share of runs: {y.replace('_', ' ')}" if outcomes_named(y) is not None else quantity(y).words
+    named = f"share of runs: {y.replace('_', ' ')}" if is_share(y) else quantity(y).words
     return f"{named[0].upper()}{named[1:]} over {panel.axis.name}{', ' if panel.held else ''}{panel.held}"
 
 
@@ -201,7 +203,7 @@ def values_section(rows: Sequence[RunRow], meta: Meta) -> Html | None:
     """A table of each figure's numbers, the paper's beside ours; None when no figure shows a metric."""
     tables = []
     for panel in panels(rows, meta):
-        described = described_columns(panel) if outcomes_named(panel.wanted.y) is None else []
+        described = described_columns(panel) if not is_share(panel.wanted.y) else []
         if described:
             tables.append(_values_table(panel, described))
     if not tables:

@@ -9,12 +9,13 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Final
 
+from testbench.campaign.dependence import phase_section, ranking_section
 from testbench.campaign.junit import junit_text
 from testbench.campaign.markup import Html, tag
 from testbench.campaign.meta import Meta
 from testbench.campaign.plots import figure_section, values_section
 from testbench.campaign.records import NO_STATEMENT, RunRow
-from testbench.campaign.sections import headline, notable_runs, outcome_table, phase_table
+from testbench.campaign.sections import headline, notable_runs, outcome_table
 
 _STYLE: Final = "report.css"
 
@@ -38,7 +39,8 @@ def html_text(rows: Sequence[RunRow], meta: Meta) -> str:
         ("figures", "Figures", figures),
         ("outcomes", "Outcomes by point", outcome_table(rows, meta)),
         ("values", "Numbers of the figures", values_section(rows, meta)),
-        ("phase", "By gait phase", phase_table(rows)),
+        ("phase", "By gait phase", phase_section(rows)),
+        ("ranking", "What matters", ranking_section(rows, meta)),
         ("runs", "Runs to look at", notable_runs(rows, meta)),
         ("how", "How it was run", _how(rows, meta)),
         ("file", "Campaign file", _file(meta)),

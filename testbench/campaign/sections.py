@@ -1,18 +1,18 @@
-"""The parts of a report that are made of runs: headline, figures, tables, phases, ranking, runs to look at."""
+"""The parts of a report that count runs: headline, outcomes by point, runs to look at."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Final
 
 from testbench.campaign.markup import Content, Html, table, tag
-from testbench.campaign.measured import EXCEEDED, FAILURE, by_point, count, ended_early, stating, words_of
+from testbench.campaign.measured import EXCEEDED, by_point, count, ended_early, stating, words_of
 from testbench.campaign.meta import Meta
 from testbench.campaign.notable import Notable, latest_noticed, odd, replay_command, slowest, words, worst
 from testbench.campaign.records import NO_STATEMENT, Outcome, RunRow
+from testbench.campaign.rules import FAILURE
 from testbench.campaign.statistics import wilson
 
 _MOST_ROWS: Final = 240
-_BINS: Final = 10
 
 COLOURS: Final = {
     Outcome.NOT_ACTIVATED: "#f0f0f0",
@@ -45,7 +45,7 @@ def headline(rows: Sequence[RunRow], meta: Meta) -> Html:
     judged = stating(rows)
     mute = Counter(row.outcome for row in rows if row.outcome in NO_STATEMENT)
     missing = meta.wanted - len(rows)
-    lines: list[Content] = [
+    lines: list[str] = [
         f"{meta.asked}, at {len(meta.points)} point{_s(len(meta.points))}: {len(rows)} runs made",
         f", {missing} of {meta.wanted} still missing. " if missing > 0 else ". ",
     ]
@@ -83,7 +83,7 @@ def outcome_table(rows: Sequence[RunRow], meta: Meta) -> Html:
         judged = stating(found)
         values = dict(point.parameters)
         cells: list[Content] = [values.get(axis, "") for axis in axes]
-        cells += [str(len(judged)), _bar(judged)]
+        cells += [str(len(judged)), bar(judged)]
         cells += [str(sum(row.outcome is outcome for row in judged)) for outcome in judged_seen]
         cells += [share_text(count(judged, what), len(judged)) for what in (FAILURE, EXCEEDED)]
         cells.append(_noticed(judged))
@@ -104,34 +104,6 @@ def outcome_table(rows: Sequence[RunRow], meta: Meta) -> Html:
         class_="note",
     )
     return tag("section", tag("h2", "Outcomes by point"), _legend(judged_seen), shown, explained, id="outcomes")
-
-
-def phase_table(rows: Sequence[RunRow]) -> Html | None:
-    """Failures by the gait phase in which the first fault began; None where no run knows one."""
-    known = [(row.first_phase, row) for row in stating(rows) if row.first_phase is not None]
-    if not known:
-        return None
-    body = []
-    for k in range(_BINS):
-        found = [row for phase, row in known if int(phase * _BINS) % _BINS == k]
-        span = f"{100 * k // _BINS} to {100 * (k + 1) // _BINS} %"
-        body.append(
-            (span, str(len(found)), _bar(found), share_text(count(found, FAILURE), len(found)), *_beyond(found))
-        )
-    several = sum(row.activated > 1 for _, row in known)
-    note = f"In {several} of these {len(known)} runs more than one window of a fault opened; " if several else ""
-    return tag(
-        "section",
-        tag("h2", "By gait phase"),
-        table(
-            "By gait phase of the first fault",
-            ("phase", "runs", "outcomes", "failed", "worst, deg beyond"),
-            body,
-            (0, 2),
-        ),
-        tag("p", f"{note}phase 0 is right heel strike; all points together.", class_="note"),
-        id="phase",
-    )
 
 
 def notable_runs(rows: Sequence[RunRow], meta: Meta) -> Html:
@@ -185,11 +157,7 @@ def _mute(rows: Sequence[RunRow]) -> str:
     return ", ".join(f"{found} {words(outcome)}" for outcome, found in counts.items())
 
 
-def _beyond(rows: Sequence[RunRow]) -> tuple[str]:
-    return (f"{max(row.beyond_deg for row in rows):.1f}" if rows else "none",)
-
-
-def _bar(rows: Sequence[RunRow]) -> Html:
+def bar(rows: Sequence[RunRow]) -> Html:
     """Outcomes of runs as a bar; the numbers stand beside it in the table."""
     counts = Counter(row.outcome for row in rows)
     parts = [
