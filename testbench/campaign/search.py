@@ -4,9 +4,11 @@ The searches themselves are plans: testbench.campaign.critical (the value of an 
 share) and testbench.campaign.combinations (the smallest sets of injectors that bring an outcome about).
 """
 
+import math
 import re
 from dataclasses import dataclass
 from decimal import Decimal
+from fractions import Fraction
 from typing import Final
 
 from testbench.campaign.statistics import check_confidence, outcomes_named
@@ -78,7 +80,7 @@ class CriticalSearch:
     @property
     def steps(self) -> int:
         """Number of the last value of the grid; the first is 0."""
-        return int(-(-(self.high - self.low) // self.tolerance))
+        return math.ceil(Fraction(self.high - self.low) / Fraction(self.tolerance))
 
     def value(self, index: int) -> Decimal:
         """Value number `index` of the grid, exactly, in `unit`."""

@@ -124,9 +124,7 @@ def clopper_pearson(successes: int, trials: int, confidence: float = 0.95) -> In
     return Interval(low, high, confidence, "Clopper-Pearson")
 
 
-def runs_for_width(
-    width: float, share: float | None = None, confidence: float = 0.95, method: str = "wilson"
-) -> int:
+def runs_for_width(width: float, share: float | None = None, confidence: float = 0.95, method: str = "wilson") -> int:
     """The smallest number of runs whose interval is at most `width` wide (0 < width < 1).
 
     share None: whatever comes out, that is, at the widest interval a count can give, which is that of n // 2 of n.
