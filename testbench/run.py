@@ -6,6 +6,7 @@ them comes from the faults.
 
 import gc
 import time
+from bisect import bisect_right
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from typing import Final
 import numpy as np
 
 from canopen_exo.bus.frame import FLAG_ERROR
-from canopen_exo.bus.medium import Medium
+from canopen_exo.bus.medium import Transmission
 from canopen_exo.bus.node import MS, NEVER, SECOND
 from fi_gateway.injector import Injector
 from fi_gateway.replay import Window
@@ -118,7 +119,7 @@ def run_rig(
     rig = build_rig(params, injectors)
     with uncollected():
         drive_through(rig, progress)
-    return record_of(rig), rig.loop.now
+        return record_of(rig), rig.loop.now
 
 
 def drive_through(rig: Rig, progress: Progress) -> None:
@@ -187,16 +188,16 @@ def record_of(rig: Rig) -> RunRecord:
         np.array([sample.dq_d for sample in samples]),
         np.array([sample.tau_command for sample in samples]),
     )
-    media = (rig.controller_bus, rig.drive_bus)
+    trace = rig.loop.trace
     return RunRecord(
-        rows=rig.loop.trace,
+        rows=trace,
         time0_ns=rig.gateway.time_zero,
         duration_ns=params.duration_ns,
         truth=truth,
         commands=commands,
         activations=[one for one in rig.gateway.records if one.start_ns < end],
         activations_after=[one for one in rig.gateway.records if one.start_ns >= end],
-        buses=tuple(_stats(rig, medium) for medium in media),
+        buses=_stats(rig, trace),
         notes=[
             RigEvent((event.time_ns - zero) / 1e9, event.joint or "HLC", event.kind, event.text)
             for event in controller.events
@@ -207,16 +208,27 @@ def record_of(rig: Rig) -> RunRecord:
     )
 
 
-def _stats(rig: Rig, medium: Medium) -> BusStats:
-    """Frames that ended within the motion, and the share of it that they lasted (error frames not counted)."""
+def _stats(rig: Rig, rows: list[Transmission]) -> tuple[BusStats, ...]:
+    """Of each bus, frames that ended within the motion, and the share of it that they lasted (no error frames)."""
+    media = (rig.controller_bus, rig.drive_bus)
     start = rig.controller.time_zero
     end = start + rig.params.duration_ns
-    frames, busy_ns = 0, 0
-    for row in rig.loop.trace:
-        if row.bus == medium.index and start < row.end_ns <= end and not row.frame.flags & FLAG_ERROR:
-            frames += 1
-            busy_ns += row.frame.bits * medium.bit_ns
-    return BusStats(medium.name, frames, busy_ns / (end - start), sum(port.dropped for port in medium.ports))
+    frames, bits = [0] * len(media), [0] * len(media)
+    first = bisect_right(rows, start, key=lambda row: row.end_ns)
+    for at in range(first, bisect_right(rows, end, key=lambda row: row.end_ns)):
+        row = rows[at]
+        if not row.frame.flags & FLAG_ERROR:
+            frames[row.bus] += 1
+            bits[row.bus] += row.frame.bits
+    return tuple(
+        BusStats(
+            medium.name,
+            frames[medium.index],
+            bits[medium.index] * medium.bit_ns / (end - start),
+            sum(port.dropped for port in medium.ports),
+        )
+        for medium in media
+    )
 
 
 def _invalid_reasons(rig: Rig) -> list[str]:

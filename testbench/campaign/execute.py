@@ -3,6 +3,7 @@
 The golden run of a setting is made once in a process and kept in its Workshop; what a run costs is its faulted part.
 """
 
+import gc
 import platform
 import time
 from collections.abc import Mapping
@@ -71,6 +72,9 @@ class Workshop:
             self.made += 1
             while len(self._golden) >= GOLDEN_KEPT:
                 del self._golden[next(iter(self._golden))]
+            gc.unfreeze()
+            gc.collect()
+            gc.freeze()  # a million objects that stay: not to be looked through again after every run
         self._golden[params] = found
         return found
 
@@ -95,7 +99,8 @@ def make_run(spec: RunSpec, workshop: Workshop) -> RunRow:
     started, wall, cpu = datetime.now(UTC), time.perf_counter(), time.process_time()
     scenario = parse_scenario(spec.scenario, f"scenario of run {spec.identity[:12]}")
     try:
-        made = _made(spec, workshop, scenario)
+        with uncollected():
+            made = _made(spec, workshop, scenario)
         judgement = judge_pair(scenario, made.golden.record, made.record)
     except (BenchError, JointEmulatorError, CanopenExoError) as error:
         row = RunRow(spec.identity, spec.wanted.point, spec.wanted.number, spec.seed, Outcome.INVALID, str(error))
@@ -156,11 +161,10 @@ def _stop_of(spec: RunSpec, scenario: Scenario) -> FailureStop | None:
 def _driven(rig: Rig, stop: FailureStop | None) -> tuple[RunRecord, int]:
     """The run to its end, early or not; the record, and when it was over [ns, loop's clock]."""
     is_early = False
-    with uncollected():
-        for _ in chunks(rig, CHUNK_NS if stop is None else LOOK_NS):
-            is_early = stop is not None and stop.reached(rig)
-            if is_early:
-                break
+    for _ in chunks(rig, CHUNK_NS if stop is None else LOOK_NS):
+        is_early = stop is not None and stop.reached(rig)
+        if is_early:
+            break
     rig.gateway.finish(rig.loop.now)
     if not is_early:
         return record_of(rig), rig.loop.now

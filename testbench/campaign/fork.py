@@ -31,7 +31,7 @@ from hlc.node import Sample
 from joint_emulators.rack import TruthRow
 from testbench.record import RunRecord
 from testbench.rig import Rig, RigParams, build_rig
-from testbench.run import chunks, record_of, uncollected
+from testbench.run import chunks, record_of
 
 SNAPSHOT_NS: Final = 200 * MS
 """Distance of the copies: whole multiples of the loop's chunks, so that a branch ends where a straight run does."""
@@ -66,10 +66,9 @@ class Trunk:
         rig = build_rig(params, [])
         digest = TraceHash()
         self.snapshots: list[Snapshot] = []
-        with uncollected():
-            for now in chunks(rig):
-                if with_snapshots and now % SNAPSHOT_NS == 0:
-                    self.snapshots.append(_snapshot(rig, digest, self.snapshots[-1].rows if self.snapshots else 0))
+        for now in chunks(rig):
+            if with_snapshots and now % SNAPSHOT_NS == 0:
+                self.snapshots.append(_snapshot(rig, digest, self.snapshots[-1].rows if self.snapshots else 0))
         rig.gateway.finish(rig.loop.now)
         self.record: RunRecord = record_of(rig)
         self.end_ns: int = rig.loop.now
