@@ -44,7 +44,7 @@ def coverages(method: Method, shares: Sequence[float], trials: int, confidence: 
 
 def mean_coverage_is_near(method: Method, trials: int, confidence: float) -> bool:
     """Averaged over all shares, at most 0.3 % below and 1 % above what is claimed."""
-    mean = float(coverages(method, (np.arange(400) + 0.5) / 400, trials, confidence).mean())
+    mean = float(coverages(method, list((np.arange(400) + 0.5) / 400), trials, confidence).mean())
     return confidence - 0.003 <= mean <= confidence + 0.01
 
 
