@@ -186,7 +186,8 @@ def flow_text(data: Data) -> str:
                 return data
         except FileErrors:
             pass
-    text: str = yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=math.inf, default_flow_style=True)
+    form = {"sort_keys": False, "allow_unicode": True, "width": math.inf, "default_flow_style": True}
+    text: str = yaml.dump(data, Dumper=_Dumper, **form)
     return text.removesuffix("...\n").strip()
 
 

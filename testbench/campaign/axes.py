@@ -236,9 +236,7 @@ def _read_keys(data: Data, at: Keys, document: Document) -> tuple[str, ...]:
     return tuple(str(key) for key in found)
 
 
-def _values(
-    data: Data, at: Keys, way: str, document: Document, stream: random.Random
-) -> Iterator[tuple[str, Keys]]:
+def _values(data: Data, at: Keys, way: str, document: Document, stream: random.Random) -> Iterator[tuple[str, Keys]]:
     """(text, place in the campaign file) of each value; what is wrong is reported and left out."""
     if way != "values":
         for text in _generated(data, at, way, document, stream):

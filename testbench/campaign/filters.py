@@ -147,7 +147,9 @@ class _Parser:
         if self._kind != "word" or name in _RESERVED:
             raise ValueError(f"expected an axis, found {name!r} (axes: {', '.join(self._axes)})")
         if name not in self._axes:
-            raise ValueError(f"there is no axis {name!r}{did_you_mean(name, self._axes)} (axes: {', '.join(self._axes)})")
+            raise ValueError(
+                f"there is no axis {name!r}{did_you_mean(name, self._axes)} (axes: {', '.join(self._axes)})"
+            )
         self._at += 1
         return _Value(name, "", number_of(self._axes[name][0]))
 

@@ -11,28 +11,31 @@ from fi_gateway.boundary import Count, Share, SpecModel, Text, Time, validate
 from fi_gateway.marked_yaml import Data, Document, Keys, did_you_mean
 from fi_gateway.quantity import describe_value
 from testbench.campaign.axes import Axis
-from testbench.campaign.records import RunRow
-from testbench.campaign.rules import FAILURE, OUTCOMES, Combinations, Critical, Figure, FixedRuns, Rule, Until
+from testbench.campaign.records import NO_STATEMENT, Outcome, RunRow
+from testbench.campaign.rules import Figure, FixedRuns, Rule, Until
+from testbench.campaign.search import CombinationSearch, CriticalSearch, split_quantity
+from testbench.campaign.statistics import outcomes_named
 from testbench.campaign.values import common_unit, number_of, text_of
 from testbench.document import JointEntry
 from testbench.scenario import JOINT_NAMES
 
 MOST_OF_A_POINT: Final = 100_000
 
+OUTCOMES: Final = tuple(outcome.value for outcome in Outcome if outcome not in NO_STATEMENT)
+
 RUN_NUMBERS: Final = tuple(
     entry.name
     for entry in fields(RunRow)
-    if entry.type in (float, float | None, "float", "float | None") and entry.name not in ("wall_s", "cpu_s", "forked_s")
+    if entry.type in (float, float | None) and entry.name not in ("cpu_s", "forked_s")
 )
 """Numbers of a run that a figure may draw."""
 
 
 def _outcome(given: object) -> str:
-    allowed = dict.fromkeys((FAILURE, *OUTCOMES))
-    if given not in allowed:
-        hint = did_you_mean(given, allowed) if isinstance(given, str) else ""
-        raise ValueError(f"unknown outcome {describe_value(given)}{hint} (allowed: {', '.join(allowed)})")
-    return str(given)
+    if not isinstance(given, str):
+        raise ValueError(f"expected an outcome, such as failure; got {describe_value(given)}")
+    outcomes_named(given)
+    return given
 
 
 def _part(given: object) -> float:
@@ -78,7 +81,7 @@ class CriticalSpec(SpecModel):
 
     axis: Text
     tolerance: Annotated[str, BeforeValidator(text_of)]
-    outcome: _Outcome = FAILURE
+    outcome: _Outcome = "failure"
     quantile: Share = 0.5
     method: Literal["bisection", "logistic"] = "bisection"
     batch: _Runs = 10
@@ -90,9 +93,10 @@ class CombinationsSpec(SpecModel):
     """A search for sets of injectors."""
 
     injectors: tuple[Text, ...]
-    outcome: _Outcome = FAILURE
+    outcome: _Outcome = "failure"
     runs: _Runs = 5
-    most: Count = 3
+    most: Count = 2
+    least: Count = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,17 +151,20 @@ def _read_search(data: Data, axes: Sequence[Axis], document: Document) -> Rule |
     if (spec.critical is None) == (spec.combinations is None):
         document.report(("search",), "expected one of critical, combinations", at_key=True)
         return None
-    if spec.combinations is not None:
-        one = spec.combinations
-        if len(one.injectors) < 1 or len(set(one.injectors)) < len(one.injectors):
-            document.report(("search", "combinations", "injectors"), "expected names of injectors, each once")
-            return None
-        return Combinations(one.injectors, one.outcome, one.runs, one.most)
-    assert spec.critical is not None
-    return _critical(spec.critical, axes, document)
+    try:
+        if spec.combinations is not None:
+            one = spec.combinations
+            return CombinationSearch(one.injectors, one.outcome, one.runs, one.most, one.least)
+        assert spec.critical is not None
+        return _critical(spec.critical, axes, document)
+    except ValueError as error:  # which key it is about, the message says
+        kind = "critical" if spec.combinations is None else "combinations"
+        document.report(("search", kind), str(error), at_key=True)
+        return None
 
 
-def _critical(spec: CriticalSpec, axes: Sequence[Axis], document: Document) -> Critical | None:
+def _critical(spec: CriticalSpec, axes: Sequence[Axis], document: Document) -> CriticalSearch | None:
+    """The search along an axis, in the axis's unit; raises ValueError."""
     at: Keys = ("search", "critical")
     axis = next((axis for axis in axes if axis.name == spec.axis), None)
     if axis is None:
@@ -170,18 +177,19 @@ def _critical(spec: CriticalSpec, axes: Sequence[Axis], document: Document) -> C
         text = f"{spec.axis} has no two numbers to search between; give its ends: between: {{from: ..., to: ...}}"
         document.report((*at, "axis"), text)
         return None
-    low, high = ordered[0][1], ordered[-1][1]
-    try:
-        (tolerance, *_), _ = common_unit((spec.tolerance, low, high))
-    except ValueError as error:
-        document.report((*at, "tolerance"), str(error))
-        return None
-    if tolerance <= 0 or not 0 < spec.quantile < 1:
-        which = "tolerance" if tolerance <= 0 else "quantile"
-        document.report((*at, which), "allowed is more than 0" if tolerance <= 0 else "allowed is between 0 % and 100 %")
-        return None
-    return Critical(
-        spec.axis, low, high, spec.outcome, spec.quantile, spec.method, spec.batch, spec.most, spec.tolerance
+    _, unit = common_unit((spec.tolerance, ordered[0][1], ordered[-1][1]))
+    low, high, tolerance = (split_quantity(text)[0] for text in (ordered[0][1], ordered[-1][1], spec.tolerance))
+    return CriticalSearch(
+        axis=spec.axis,
+        low=low,
+        high=high,
+        tolerance=tolerance,
+        unit=unit,
+        outcome=spec.outcome,
+        quantile=spec.quantile,
+        method=spec.method,
+        batch=spec.batch,
+        most=spec.most,
     )
 
 
@@ -189,13 +197,13 @@ def read_figures(given: Sequence[FigureSpec], axes: Sequence[Axis], document: Do
     """The figures of the report, each about an axis that there is and something that is measured."""
     known = {axis.name: axis for axis in axes}
     measured = (*(f"{joint}.{name}" for joint in JOINT_NAMES for name in JointEntry.__annotations__), *RUN_NUMBERS)
-    allowed = (*measured, FAILURE, *OUTCOMES)
+    allowed = (*measured, *OUTCOMES)
     figures = []
     for index, spec in enumerate(given):
         at: Keys = ("report", "figures", index)
         if spec.y not in allowed:
             text = f"unknown quantity {spec.y!r}{did_you_mean(spec.y, allowed)} (allowed: JOINT.QUANTITY as in the"
-            document.report((*at, "y"), f"{text} document of a run, {', '.join((*RUN_NUMBERS, FAILURE, *OUTCOMES))})")
+            document.report((*at, "y"), f"{text} document of a run, {', '.join((*RUN_NUMBERS, *OUTCOMES))})")
         axis = known.get(spec.x)
         if axis is None:
             names = ", ".join(known) or "none"

@@ -1,19 +1,8 @@
-"""What a campaign asks for, as plain data: how many runs, what is searched, which figures; read by testbench.campaign.schema."""
+"""What a campaign file asks for, as plain data: how many runs, when they end, which figures."""
 
 from dataclasses import dataclass
-from typing import Final, Literal
 
-from testbench.campaign.records import FAILURES, NO_STATEMENT, Outcome
-
-FAILURE: Final = "failure"
-
-OUTCOMES: Final = tuple(outcome.value for outcome in Outcome if outcome not in NO_STATEMENT)
-"""What a rule may name; `failure` stands for all failures."""
-
-
-def counts_as(outcome: Outcome, name: str) -> bool:
-    """Whether a run of that outcome counts for a rule about `name`."""
-    return outcome in FAILURES if name == FAILURE else outcome.value == name
+from testbench.campaign.search import CombinationSearch, CriticalSearch
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,38 +26,7 @@ class Until:
     most: int
 
 
-@dataclass(frozen=True, slots=True)
-class Critical:
-    """The value of an axis at which `quantile` of the runs have the outcome; for every point of the other axes.
-
-    low, high: the ends between which it is looked for, tolerance: how exactly, as texts with their unit.
-    """
-
-    axis: str
-    low: str
-    high: str
-    outcome: str
-    quantile: float
-    method: Literal["bisection", "logistic"]
-    batch: int
-    most: int
-    tolerance: str
-
-
-@dataclass(frozen=True, slots=True)
-class Combinations:
-    """The smallest sets of injectors that lead to the outcome: `runs` a set, at most `most` injectors in one.
-
-    Its points have the axis `injectors`, with values such as "a + b"; see testbench.campaign.settings.
-    """
-
-    injectors: tuple[str, ...]
-    outcome: str
-    runs: int
-    most: int
-
-
-Rule = FixedRuns | Until | Critical | Combinations
+Rule = FixedRuns | Until | CriticalSearch | CombinationSearch
 
 
 @dataclass(frozen=True, slots=True)

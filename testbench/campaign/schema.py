@@ -4,6 +4,8 @@ A file is read once, every complaint at once with its place, the scenario's own 
 included: what `load_campaign` returns can be run. The lists of a file are data, nothing in it is evaluated.
 """
 
+import itertools
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -30,8 +32,9 @@ from testbench.campaign.filters import Filter, parse_filter
 from testbench.campaign.identity import identity, with_seed
 from testbench.campaign.records import Point, RunSpec, Wanted
 from testbench.campaign.rule_specs import FigureSpec, StopSpec, read_figures, read_rule
-from testbench.campaign.rules import Critical, Figure, FixedRuns, Rule, StopEarly
-from testbench.campaign.settings import COMBINATION_AXIS, Settings, checked
+from testbench.campaign.rules import Figure, FixedRuns, Rule, StopEarly
+from testbench.campaign.search import CombinationSearch, CriticalSearch
+from testbench.campaign.settings import COMBINATION_AXIS, Settings, checked, with_injectors
 from testbench.scenario import MAX_SEED, Name, Seed
 
 MOST_POINTS: Final = 20_000
@@ -164,20 +167,23 @@ def campaign_in(document: Document, text: str, changes: Sequence[str], runs: int
     axes = _read_axes(data.get("axes"), document, seed)
     rule = read_rule(data.get("runs"), data.get("search"), axes, document)
     _check_open(axes, rule, document)
-    searched = rule.axis if isinstance(rule, Critical) else ""
+    searched = rule.axis if isinstance(rule, CriticalSearch) else ""
     spanned = [axis for axis in axes if axis.name != searched]
     together = _read_together(whole.together if whole is not None else (), spanned, document)
-    filters = _read_filters(data.get("filter"), spanned, document)
-    figures = read_figures(whole.report.figures if whole is not None else (), axes, document)
+    broken = _names(data.get("axes")) - {axis.name for axis in axes}
+    filters = _read_filters(data.get("filter"), spanned, broken, document)
+    figures = read_figures(whole.report.figures if whole is not None and not broken else (), axes, document)
     base, messages = _base(data, document, changes)
+    if isinstance(rule, CombinationSearch):
+        _check_injectors(rule, base, document)
     _check_keys(axes, base, document)
     points = () if document.problems else _read_points(spanned, together, filters, rule, seed, document)
     _raise(document, messages)
     assert whole is not None
     assert rule is not None
-    settings = Settings(base, tuple(axes), _labels(axes, document))
-    ends = _with_ends(points, rule, axes)
-    messages, texts = checked(settings, ends)
+    combined = rule.injectors if isinstance(rule, CombinationSearch) else ()
+    settings = Settings(base, tuple(axes), combined, _labels(axes, document))
+    messages, texts = checked(settings, _tried_first(points, rule, axes))
     if messages:
         raise FileErrors(messages)
     stop = whole.stop_early
@@ -226,7 +232,7 @@ def _read_axes(data: Data, document: Document, seed: int) -> list[Axis]:
 def _check_open(axes: Sequence[Axis], rule: Rule | None, document: Document) -> None:
     """Report axes of which only the ends are given and that no search moves along."""
     for axis in axes:
-        if axis.is_open and not (isinstance(rule, Critical) and rule.axis == axis.name):
+        if axis.is_open and not (isinstance(rule, CriticalSearch) and rule.axis == axis.name):
             text = "two ends are for the axis that search.critical moves along; here give range, linear, log or values"
             document.report(("axes", axis.name, "between"), text, at_key=True)
 
@@ -251,11 +257,18 @@ def _read_together(
     return tuple(tuple(names) for names in given)
 
 
-def _read_filters(data: Data, axes: Sequence[Axis], document: Document) -> list[Filter]:
+def _names(data: Data) -> set[str]:
+    return set(data) if isinstance(data, dict) else set()
+
+
+def _read_filters(data: Data, axes: Sequence[Axis], broken: set[str], document: Document) -> list[Filter]:
+    """The filters; those about axes that are wrong themselves are not looked at."""
     values = {axis.name: axis.texts for axis in axes}
     filters = []
     items = data if isinstance(data, list) else [] if data is None else [data]
     for index, item in enumerate(items):
+        if not broken.isdisjoint(re.findall(r"\w+", str(item))):
+            continue
         try:
             filters.append(parse_filter(item, values))
         except ValueError as error:
@@ -324,6 +337,14 @@ def _check_keys(axes: Sequence[Axis], base: Document, document: Document) -> Non
                     document.report(at, f"{key}: {tried.problems[0].text} (in {base.source})")
 
 
+def _check_injectors(rule: CombinationSearch, base: Document, document: Document) -> None:
+    known = Settings(base, ()).injectors
+    for name in rule.injectors if base.data is not None else ():
+        if name not in known:
+            text = f"there is no injector {name!r}{did_you_mean(name, known)} (injectors: {', '.join(known) or 'none'})"
+            document.report(("search", "combinations", "injectors"), text)
+
+
 def _deep(data: Data) -> object:
     if isinstance(data, dict):
         return {key: _deep(value) for key, value in data.items()}
@@ -346,7 +367,9 @@ def _read_points(
     kept = tuple(grid(axes, together, filters))
     each = rule.runs if isinstance(rule, FixedRuns) else getattr(rule, "most", 0)
     if not kept:
-        document.report(("filter",), f"none of the {points} points is left: the filters exclude each other", at_key=True)
+        document.report(
+            ("filter",), f"none of the {points} points is left: the filters exclude each other", at_key=True
+        )
     elif len(kept) > MOST_POINTS:
         document.report(("axes",), f"that is a grid of {len(kept)} points; allowed are {MOST_POINTS}", at_key=True)
     elif len(kept) * each > MOST_RUNS:
@@ -357,17 +380,18 @@ def _read_points(
     return kept
 
 
-def _with_ends(points: Sequence[Point], rule: Rule, axes: Sequence[Axis]) -> list[Point]:
-    """What is looked at before the first run: all points; of a search both ends of the axis it moves along."""
-    if not isinstance(rule, Critical):
-        return list(points)
-    found = []
-    for point in points:
-        texts = dict(point.parameters)
-        for end in (rule.low, rule.high):
-            both = {**texts, rule.axis: end}
-            found.append(Point(tuple((axis.name, both[axis.name]) for axis in axes)))
-    return found
+def _tried_first(points: Sequence[Point], rule: Rule, axes: Sequence[Axis]) -> list[Point]:
+    """What is looked at before the first run: all points; of a search the ends between which it will move."""
+    if isinstance(rule, CriticalSearch):
+        found = []
+        for point, index in itertools.product(points, (0, rule.steps)):
+            texts = {**dict(point.parameters), rule.axis: rule.text(index)}
+            found.append(Point(tuple((axis.name, texts[axis.name]) for axis in axes)))
+        return found
+    if isinstance(rule, CombinationSearch):
+        sets = [(name,) for name in rule.injectors]
+        return [with_injectors(point, some) for point, some in itertools.product(points, sets)]
+    return list(points)
 
 
 def _labels(axes: Sequence[Axis], document: Document) -> dict[tuple[str, str], str]:

@@ -15,22 +15,25 @@ COMBINATION_AXIS: Final = "injectors"
 """Name of the axis of a search for combinations; its values name the injectors that are enabled."""
 
 JOINED: Final = " + "
+NONE: Final = "none"
 
 
-def combination_text(injectors: Iterable[str]) -> str:
-    """The value of COMBINATION_AXIS for a set of injectors, in the order given: "a + b"; "none" for none."""
-    return JOINED.join(injectors) or "none"
+def with_injectors(point: Point, injectors: Iterable[str]) -> Point:
+    """The point at which of the injectors that are combined only these are enabled: injectors = "a + b"."""
+    return Point((*point.parameters, (COMBINATION_AXIS, JOINED.join(injectors) or NONE)))
 
 
 @dataclass(frozen=True, slots=True)
 class Settings:
     """Makes scenarios of points. base: the scenario's document, changes for every run included, never changed here.
 
+    combined: injectors that a search for combinations switches on and off, all others stay as they are.
     labels: (axis, value) -> where the value stands in the campaign file, for messages.
     """
 
     base: Document
     axes: Sequence[Axis]
+    combined: tuple[str, ...] = ()
     labels: dict[tuple[str, str], str] = field(default_factory=dict)
 
     def scenario(self, point: Point) -> Scenario:
@@ -47,7 +50,7 @@ class Settings:
     def _settings(self, name: str, text: str) -> Sequence[tuple[str, str]]:
         if name == COMBINATION_AXIS:
             enabled = text.split(JOINED)
-            return [(f"injectors.{one}.enabled", "true" if one in enabled else "false") for one in self.injectors]
+            return [(f"injectors.{one}.enabled", "true" if one in enabled else "false") for one in self.combined]
         for axis in self.axes:
             if axis.name == name:
                 return axis.settings(text)
@@ -104,4 +107,3 @@ def _copied(document: Document) -> Document:
         set(document.broken),
         document.overrides,
     )
-
