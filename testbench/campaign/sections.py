@@ -5,11 +5,10 @@ from collections.abc import Mapping, Sequence
 from typing import Final
 
 from testbench.campaign.markup import Content, Html, table, tag
-from testbench.campaign.measured import EXCEEDED, by_point, count, ended_early, stating, words_of
+from testbench.campaign.measured import EXCEEDED, FAILURE, by_point, count, ended_early, stating, words_of
 from testbench.campaign.meta import Meta
 from testbench.campaign.notable import Notable, latest_noticed, odd, replay_command, slowest, words, worst
 from testbench.campaign.records import NO_STATEMENT, Outcome, RunRow
-from testbench.campaign.rules import FAILURE
 from testbench.campaign.statistics import wilson
 
 _MOST_ROWS: Final = 240
@@ -51,8 +50,8 @@ def headline(rows: Sequence[RunRow], meta: Meta) -> Html:
     ]
     if mute:
         parts = ", ".join(f"{found} {words(outcome)}" for outcome, found in mute.items())
-        verb = "makes" if mute.total() == 1 else "make"
-        lines.append(f"{mute.total()} of them {verb} no statement ({parts}) and are in no share below. ")
+        makes, is_ = ("makes", "is") if mute.total() == 1 else ("make", "are")
+        lines.append(f"{mute.total()} of them {makes} no statement ({parts}) and {is_} in no share below. ")
     failing = count(judged, FAILURE)
     summary = tag(
         "p",
