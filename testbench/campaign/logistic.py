@@ -65,7 +65,7 @@ class LogisticFit:
         best = _maximum(
             data, np.zeros(data.u.size), data.columns, np.array([self.a + self.b * data.shift, self.b * data.scale])
         )
-        level = _maximum(data, np.zeros(data.u.size), data.columns[:, :1], best.free[:1])
+        level = _maximum(data, np.zeros(data.u.size), data.columns[:, :1], np.zeros(1))
         if self.b == 0 or 2 * (best.value - level.value) <= limit:
             return Interval(-math.inf, math.inf, confidence, "profile likelihood")
         offset = np.full(data.u.size, _log_odds(q))
@@ -165,6 +165,9 @@ def _maximum(data: _Data, offset: Array, columns: Array, start: Array) -> _Best:
     """
     free = start
     value, share, leverage = _penalised(data, offset + columns @ free)
+    if math.isinf(value):  # so steep that every share is 0 or 1 to the last digit
+        free = np.zeros_like(start)
+        value, share, leverage = _penalised(data, offset + columns @ free)
     for _ in range(STEPS):
         trials = data.trials + leverage
         gradient = columns.T @ (data.successes + leverage / 2 - trials * share)

@@ -16,6 +16,8 @@ from testbench.campaign.statistics import check_confidence, outcomes_named
 BISECTION: Final = "bisection"
 LOGISTIC: Final = "logistic"
 METHODS: Final = (BISECTION, LOGISTIC)
+SCANNED: Final = 5
+"""Values, from end to end of the axis, of which each gets one batch before the search proper begins."""
 MAX_STEPS: Final = 1_000_000
 """Most values on the grid of a search; 2^20 of them are 20 halvings."""
 
@@ -74,8 +76,8 @@ class CriticalSearch:
             raise ValueError(f"method: {self.method!r} given; allowed: {', '.join(METHODS)}")
         if self.batch < 1:
             raise ValueError(f"batch: {self.batch} given; allowed from 1 up")
-        if self.most < self.batch:
-            raise ValueError(f"most: {self.most} given; allowed from one batch ({self.batch}) up")
+        if self.most < SCANNED * self.batch:
+            raise ValueError(f"most: {self.most} given; allowed from {SCANNED} batches ({SCANNED * self.batch}) up")
 
     @property
     def steps(self) -> int:
