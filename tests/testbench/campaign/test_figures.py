@@ -2,6 +2,7 @@
 
 import re
 
+import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -107,7 +108,7 @@ def test_share_is_drawn_in_percent_with_its_interval() -> None:
     """0..1 in the data, 0 to 100 % in the figure."""
     figure = share_figure([Share(0.1, 0.0, 0.0, 0.2), Share(0.2, 0.5, 0.3, 0.7)], [(0.2, 0.9)], ("x", "y"))
     (axes,) = figure.axes
-    drawn = [line.get_ydata().tolist() for line in axes.lines]
+    drawn = [list(np.asarray(line.get_ydata())) for line in axes.lines]
     assert [0.0, 50.0] in drawn
     assert [90.0] in drawn
     low, high = axes.get_ylim()
