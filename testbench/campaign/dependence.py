@@ -9,8 +9,9 @@ from testbench.campaign.meta import Meta
 from testbench.campaign.phases import by_phase
 from testbench.campaign.ranking import Effect, Ranking, rank_parameters
 from testbench.campaign.records import RunRow
-from testbench.campaign.sections import bar, share_text
+from testbench.campaign.sections import bar
 from testbench.campaign.statistics import NotEstimableError
+from testbench.campaign.tables import share_text
 
 _BINS: Final = 10
 PHASE: Final = "gait phase of the first fault"

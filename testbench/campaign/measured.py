@@ -13,6 +13,8 @@ FAILURE: Final = Outcome.FAILURE.value
 """Where a share is named: any of the failures."""
 EXCEEDED: Final = "exceeded"
 """Any limit exceeded: an error or a failure."""
+BEYOND_3DEG: Final = "beyond_3deg"
+"""A joint beyond its range by more than 3 deg, because mechanical pins are soft."""
 
 _UNITS: Final = (("_rad_s", "rad/s"), ("_rad", "rad"), ("_nm", "N m"), ("_deg", "deg"), ("_rpm", "rpm"), ("_s", "s"))
 
@@ -69,7 +71,9 @@ def stating(rows: Iterable[RunRow]) -> list[RunRow]:
 
 
 def count(rows: Iterable[RunRow], what: str) -> int:
-    """How many runs came out as named: `failure`, an outcome, or `exceeded`."""
+    """How many runs came out as named: `failure`, an outcome, `exceeded` or `beyond_3deg`."""
+    if what == BEYOND_3DEG:
+        return sum(row.failures_at_3deg > 0 for row in rows)
     if what == EXCEEDED:
         return sum(row.errors > 0 or row.failures > 0 or row.outcome in FAILURES for row in rows)
     named = outcomes_named(what)

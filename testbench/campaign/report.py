@@ -16,7 +16,7 @@ from testbench.campaign.meta import Meta
 from testbench.campaign.plots import figure_section, values_section
 from testbench.campaign.records import NO_STATEMENT, RunRow
 from testbench.campaign.searched import search_section
-from testbench.campaign.sections import headline, notable_runs, outcome_table
+from testbench.campaign.sections import headline, notable_runs, outcome_section
 
 _STYLE: Final = "report.css"
 
@@ -39,7 +39,7 @@ def html_text(rows: Sequence[RunRow], meta: Meta) -> str:
     sections: list[tuple[str, str, Html | None]] = [
         ("figures", "Figures", figures),
         ("search", "What was searched", search_section(rows, meta, drawn + 1)),
-        ("outcomes", "Outcomes by point", outcome_table(rows, meta)),
+        ("outcomes", "Outcomes by point", outcome_section(rows, meta)),
         ("values", "Numbers of the figures", values_section(rows, meta)),
         ("phase", "By gait phase", phase_section(rows)),
         ("ranking", "What matters", ranking_section(rows, meta)),

@@ -10,6 +10,7 @@ from testbench.campaign.measured import by_point
 from testbench.campaign.meta import Meta
 from testbench.campaign.records import Point, RunRow
 from testbench.campaign.search import CriticalSearch
+from testbench.campaign.tables import Table
 
 _IN_CELLS: Final = {Answer.BEYOND: ">", Answer.BELOW: "<"}
 
@@ -29,33 +30,40 @@ def search_section(rows: Sequence[RunRow], meta: Meta, figure: int) -> Html | No
         return None
     search = meta.rule
     others = [axis.name for axis in meta.axes if axis.name != search.axis]
-    heads = (*others, f"critical {search.axis}", "answer", "runs", "left out", "why")
-    body: list[list[Content]] = [
-        [
-            *(text for _, text in one.point.parameters),
-            one.text,
-            _words(one.answer),
-            str(one.runs),
-            str(one.excluded),
-            tag("span", one.reason, class_="wrap"),
-        ]
-        for one in results
-    ]
     quantile, confidence = f"{100 * search.quantile:g} %", f"{100 * search.confidence:g} %"
     said = (
         f"The {search.axis} at which {quantile} of the runs show {search.outcome}, by {search.method}, to "
         f"{search.tolerance:f} {search.unit}; in brackets its interval at {confidence}. Left out are runs that make no "
         "statement."
     )
-    texts = [*range(len(others) + 2), len(heads) - 1]
+    found = critical_table(results)
+    body: list[list[Content]] = [[*cells[:-1], tag("span", cells[-1], class_="wrap")] for cells in found.body]
     return tag(
         "section",
         tag("h2", f"Critical {search.axis}"),
         tag("p", said),
         *([_map(results, others, figure)] if len(others) == 2 else []),
-        table(f"Critical {search.axis}", heads, body, texts),
+        table(found.caption, found.heads, body, found.texts),
         id="search",
     )
+
+
+def critical_table(results: Sequence[CriticalResult]) -> Table:
+    """A row for each combination of the other axes. results: at least one."""
+    axis, others = results[0].search.axis, [name for name, _ in results[0].point.parameters]
+    heads = (*others, f"critical {axis}", "answer", "runs", "left out", "why")
+    body = [
+        (
+            *(text for _, text in one.point.parameters),
+            one.text,
+            one.answer.value.replace("_", " "),
+            str(one.runs),
+            str(one.excluded),
+            one.reason,
+        )
+        for one in results
+    ]
+    return Table(f"Critical {axis}", heads, tuple(body), frozenset({*range(len(others) + 2), len(heads) - 1}))
 
 
 def _map(results: Sequence[CriticalResult], others: Sequence[str], figure: int) -> Html:
@@ -86,7 +94,3 @@ def _value(one: CriticalResult) -> float | None:
 def _cell(one: CriticalResult) -> str:
     value = _value(one)
     return "?" if value is None else f"{_IN_CELLS.get(one.answer, '')}{value:.3g}"
-
-
-def _words(answer: Answer) -> str:
-    return answer.value.replace("_", " ")
