@@ -19,8 +19,11 @@ class Lock:
         self._path: Final[Path] = path
         self._file: int = -1
 
-    def acquire(self) -> int | None:
-        """Take it; the process that has it otherwise (0 when it cannot be told). May raise OSError."""
+    def acquire(self, note: bool = True) -> int | None:
+        """Take it; the process that has it otherwise (0 when it cannot be told). May raise OSError.
+
+        note: write this process's number into the file.
+        """
         file = os.open(self._path, os.O_RDWR | os.O_CREAT, 0o666)
         try:
             if sys.platform == "win32":
@@ -33,10 +36,11 @@ class Lock:
             text = os.read(file, 32).decode("ascii", "replace").strip()
             os.close(file)
             return int(text) if text.isdecimal() else 0
-        os.ftruncate(file, 0)
-        os.lseek(file, 0, os.SEEK_SET)
-        os.write(file, f"{os.getpid()}\n".encode())
         self._file = file
+        if note:
+            os.ftruncate(file, 0)
+            os.lseek(file, 0, os.SEEK_SET)
+            os.write(file, f"{os.getpid()}\n".encode())
         return None
 
     def release(self) -> None:
@@ -44,3 +48,14 @@ class Lock:
         if self._file >= 0:
             os.close(self._file)
             self._file = -1
+
+
+def is_locked(path: Path) -> bool:
+    """Whether a process has the lock now. May raise OSError."""
+    if not path.exists():
+        return False
+    lock = Lock(path)
+    if lock.acquire(note=False) is not None:
+        return True
+    lock.release()
+    return False

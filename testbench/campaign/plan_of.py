@@ -9,9 +9,9 @@ from testbench.errors import BenchError
 
 def plan_of(campaign: Campaign) -> Plan:
     """The plan; raises BenchError for a rule there is no plan for."""
-    match campaign.rule:
-        case FixedRuns():
-            return GridPlan(campaign.points, campaign.rule)
-        case Until():
-            return SequentialPlan(campaign.points, campaign.rule)
+    rule = campaign.rule
+    if isinstance(rule, FixedRuns):
+        return GridPlan(campaign.points, rule)
+    if isinstance(rule, Until):
+        return SequentialPlan(campaign.points, rule)
     raise BenchError(f"campaign {campaign.name}: search is not available yet; available: runs")

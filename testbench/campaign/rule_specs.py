@@ -11,8 +11,8 @@ from fi_gateway.boundary import Count, Share, SpecModel, Text, Time, validate
 from fi_gateway.marked_yaml import Data, Document, Keys, did_you_mean
 from fi_gateway.quantity import describe_value
 from testbench.campaign.axes import Axis
-from testbench.campaign.records import NO_STATEMENT, Outcome, RunRow
-from testbench.campaign.rules import Figure, FixedRuns, Rule, Until
+from testbench.campaign.records import RunRow
+from testbench.campaign.rules import FAILURE, OUTCOMES, Figure, FixedRuns, Rule, Until
 from testbench.campaign.search import CombinationSearch, CriticalSearch, split_quantity
 from testbench.campaign.statistics import outcomes_named
 from testbench.campaign.values import common_unit, number_of, text_of
@@ -20,8 +20,6 @@ from testbench.document import JointEntry
 from testbench.scenario import JOINT_NAMES
 
 MOST_OF_A_POINT: Final = 100_000
-
-OUTCOMES: Final = tuple(outcome.value for outcome in Outcome if outcome not in NO_STATEMENT)
 
 RUN_NUMBERS: Final = tuple(
     entry.name
@@ -81,7 +79,7 @@ class CriticalSpec(SpecModel):
 
     axis: Text
     tolerance: Annotated[str, BeforeValidator(text_of)]
-    outcome: _Outcome = "failure"
+    outcome: _Outcome = FAILURE
     quantile: Share = 0.5
     method: Literal["bisection", "logistic"] = "bisection"
     batch: _Runs = 10
@@ -93,7 +91,7 @@ class CombinationsSpec(SpecModel):
     """A search for sets of injectors."""
 
     injectors: tuple[Text, ...]
-    outcome: _Outcome = "failure"
+    outcome: _Outcome = FAILURE
     runs: _Runs = 5
     most: Count = 2
     least: Count = 1

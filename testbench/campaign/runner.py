@@ -191,6 +191,7 @@ class Runner:
         version, state = self._way.version, self._state
         while True:
             self._wanted = self._plan.wanted(state.known)
+            self._store.set_meta({"wanted": str(len(self._wanted))})
             found = 0
             self._queue.clear()
             flying = {(one.point, one.number) for one in state.in_flight.values()}

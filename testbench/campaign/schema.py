@@ -80,8 +80,9 @@ class CampaignFile(SpecModel):
 class Campaign:
     """A campaign that can be run.
 
-    source: the file, as named; text: its content; changes: `--set` on top of it; axes: as in the file; points: of the
-    grid, in order, for a search those of the axes it does not move along. texts: point -> resolved YAML, seed 0.
+    source: the file, as named; text: its content; changes, runs: `--set` and `--runs` on top of it; axes: as in the
+    file; points: of the grid, in order, for a search those of the axes it does not move along. texts: point -> resolved
+    YAML, seed 0.
     """
 
     name: str
@@ -89,6 +90,7 @@ class Campaign:
     source: str
     text: str
     changes: tuple[str, ...]
+    runs: int | None
     seed: int
     axes: tuple[Axis, ...]
     points: tuple[Point, ...]
@@ -141,6 +143,14 @@ def is_campaign(data: Data) -> bool:
     return isinstance(data, dict) and not _KEYS.isdisjoint(data)
 
 
+def is_campaign_file(path: Path | str) -> bool:
+    """Whether a file can be read and is a campaign."""
+    try:
+        return is_campaign(load(path).data)
+    except FileErrors:
+        return False
+
+
 def load_campaign(path: Path | str, changes: Sequence[str] = (), runs: int | None = None) -> Campaign:
     """The campaign in a file. changes: `key=value` for the scenario; runs: instead of the file's runs per point.
 
@@ -156,8 +166,18 @@ def parse_campaign(text: str, source: str, changes: Sequence[str] = (), runs: in
     return campaign_in(parse(text, source), text, changes, runs)
 
 
-def campaign_in(document: Document, text: str, changes: Sequence[str], runs: int | None) -> Campaign:
-    """Check shape, then sense, then every point; raises FileErrors."""
+def stored_campaign(text: str, source: str, scenario: str, changes: Sequence[str], runs: int | None) -> Campaign:
+    """A campaign that was checked when it was run; scenario: its text then, as the file may be another one by now."""
+    return campaign_in(parse(text, source), text, changes, runs, scenario)
+
+
+def campaign_in(
+    document: Document, text: str, changes: Sequence[str], runs: int | None, stored: str | None = None
+) -> Campaign:
+    """Check shape, then sense, then every point; raises FileErrors.
+
+    stored: text of the scenario, and then the points are not looked at.
+    """
     if runs is not None and isinstance(document.data, dict) and "search" not in document.data:
         document.data["runs"] = runs
         document.values["runs",] = document.keys["runs",] = Mark(1, 0, f"--runs {runs}")
@@ -173,7 +193,7 @@ def campaign_in(document: Document, text: str, changes: Sequence[str], runs: int
     broken = _names(data.get("axes")) - {axis.name for axis in axes}
     filters = _read_filters(data.get("filter"), spanned, broken, document)
     figures = read_figures(whole.report.figures if whole is not None and not broken else (), axes, document)
-    base, messages = _base(data, document, changes)
+    base, messages = _base(data, document, changes, stored)
     if isinstance(rule, CombinationSearch):
         _check_injectors(rule, base, document)
     _check_keys(axes, base, document)
@@ -183,9 +203,10 @@ def campaign_in(document: Document, text: str, changes: Sequence[str], runs: int
     assert rule is not None
     combined = rule.injectors if isinstance(rule, CombinationSearch) else ()
     settings = Settings(base, tuple(axes), combined, _labels(axes, document))
-    messages, texts = checked(settings, _tried_first(points, rule, axes))
-    if messages:
-        raise FileErrors(messages)
+    texts: dict[Point, str] = {}
+    if stored is None:
+        messages, texts = checked(settings, _tried_first(points, rule, axes))
+        _raise(document, messages)
     stop = whole.stop_early
     return Campaign(
         name=whole.name,
@@ -193,6 +214,7 @@ def campaign_in(document: Document, text: str, changes: Sequence[str], runs: int
         source=document.source,
         text=text,
         changes=tuple(changes),
+        runs=runs,
         seed=whole.seed,
         axes=tuple(axes),
         points=points,
@@ -276,14 +298,17 @@ def _read_filters(data: Data, axes: Sequence[Axis], broken: set[str], document: 
     return filters
 
 
-def _base(data: dict[str, Data], document: Document, changes: Sequence[str]) -> tuple[Document, list[str]]:
+def _base(
+    data: dict[str, Data], document: Document, changes: Sequence[str], stored: str | None
+) -> tuple[Document, list[str]]:
     """The scenario with the changes for every run, and what is wrong with it by itself."""
     given = data.get("scenario")
     if isinstance(given, dict):
         base = _part(document, ("scenario",))
     elif isinstance(given, str):
         try:
-            base = load(Path(document.source).parent / given)
+            path = Path(document.source).parent / given
+            base = load(path) if stored is None else parse(stored, str(path))
         except FileErrors as error:
             first = error.messages[0]
             if first.endswith("no such file"):
@@ -296,6 +321,8 @@ def _base(data: dict[str, Data], document: Document, changes: Sequence[str]) -> 
             document.report(("scenario",), f"expected the path of a scenario, or a scenario as a mapping; got {got}")
         return Document(document.source), []
     settings = data.get("set")
+    if isinstance(settings, dict) and "seed" in settings:
+        document.report(("set", "seed"), "run k of every point has the campaign's seed plus k; set `seed:` itself")
     for key, text in read_settings(settings) if isinstance(settings, dict) else ():
         mark = document.mark(("set", key))
         base.overrides += 1

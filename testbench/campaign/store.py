@@ -17,7 +17,7 @@ from typing import Final, final
 from testbench.campaign.records import InjectionRow, Outcome, Point, RunRow
 from testbench.campaign.values import number_of
 from testbench.errors import BenchError
-from testbench.lock import Lock
+from testbench.lock import Lock, is_locked
 
 FORMAT: Final = 1
 """Counts up with every change of the tables."""
@@ -111,6 +111,10 @@ class Store:
         self.connection.close()
         if self._lock is not None:
             self._lock.release()
+
+    def is_held(self) -> bool:
+        """Whether a runner is writing to it now."""
+        return self._lock is not None or is_locked(_lock_of(self.path))
 
     def meta(self, key: str) -> str:
         """A text about the campaign, "" when there is none."""
@@ -279,7 +283,7 @@ def open_store(path: Path, *, write: bool = False) -> Store:
     try:
         if write:
             path.parent.mkdir(parents=True, exist_ok=True)
-            lock = Lock(path.with_name(f"{path.name}.lock"))
+            lock = Lock(_lock_of(path))
             holder = lock.acquire()
             if holder is not None:
                 raise StoreError(
@@ -294,6 +298,10 @@ def open_store(path: Path, *, write: bool = False) -> Store:
         if lock is not None:
             lock.release()
         raise
+
+
+def _lock_of(path: Path) -> Path:
+    return path.with_name(f"{path.name}.lock")
 
 
 def _connected(path: Path, write: bool) -> sqlite3.Connection:
