@@ -4,6 +4,7 @@ At each instant: frames that end (by bus; each bus ends at most one), then nodes
 buses arbitrate. No clock is read: the same nodes give the same trace on every machine.
 """
 
+import copy
 from typing import Final, final
 
 from canopen_exo.bus.frame import Frame
@@ -43,15 +44,30 @@ class Loop:
         self._ends: Final[list[int]] = []
         self._passed: Final[list[tuple[Frame, Port]]] = []
         self._rows: Final[list[Transmission]] = []
+        self._recalled: int = 0
 
     @property
     def trace(self) -> list[Transmission]:
         """Every frame that passed a bus so far, in loop order."""
         rows = self._rows
-        for at in range(len(rows), len(self._ends)):
+        for at in range(len(rows) - self._recalled, len(self._ends)):
             frame, sender = self._passed[at]
             rows.append(Transmission(self._ends[at], sender.medium.index, frame, sender.number))
         return rows
+
+    def recall(self, rows: list[Transmission]) -> None:
+        """For a copy, whose trace is empty: the rows that the original had then; to be called before anything runs."""
+        self._rows.extend(rows)
+        self._recalled = len(rows)
+
+    def __deepcopy__(self, memo: dict[int, object]) -> "Loop":
+        """The same state between two instants: media with what waits on them, nodes. The trace is left behind."""
+        twin = Loop(copy.deepcopy(self.media, memo))
+        memo[id(self)] = twin
+        twin.nodes = copy.deepcopy(self.nodes, memo)
+        twin.outs = copy.deepcopy(self.outs, memo)
+        twin.now = self.now
+        return twin
 
     def connect(self, node: Node, media: list[Medium]) -> None:
         """Add a node; its port k is attached to media[k]. Order of adding is the order of waking."""
