@@ -4,14 +4,14 @@ from collections.abc import Sequence
 from typing import Final
 
 from testbench.campaign.markup import Content, Html, table, tag
-from testbench.campaign.measured import count, is_share, number_at, quantity, stating, value_of
+from testbench.campaign.measured import FAILURE, count, is_share, number_at, quantity, stating, value_of
 from testbench.campaign.meta import Meta
 from testbench.campaign.phases import by_phase
 from testbench.campaign.ranking import Effect, Ranking, rank_parameters
 from testbench.campaign.records import RunRow
-from testbench.campaign.rules import FAILURE
-from testbench.campaign.sections import bar, share_text
+from testbench.campaign.sections import bar
 from testbench.campaign.statistics import NotEstimableError
+from testbench.campaign.tables import share_text
 
 _BINS: Final = 10
 PHASE: Final = "gait phase of the first fault"
@@ -55,8 +55,8 @@ def ranking_section(rows: Sequence[RunRow], meta: Meta) -> Html | None:
     if not judged:
         return None
     note = (
-        "Explained: share of the variance of the ranks that the parameter explains, corrected for chance, so that it "
-        "may come out below 0. Rank correlation: Spearman, its 95 % interval with the seeds as groups; it sees what "
+        "Explained: share of the variance of the ranks that the parameter explains, corrected for chance. "
+        "Rank correlation: Spearman, its 95 % interval with the seeds as groups; it sees what "
         "rises or falls, eta squared any difference between values. What acts only in combination is not seen. Runs "
         "in which no fault began have no gait phase and are not in here."
     )
@@ -99,7 +99,7 @@ def _effect(one: Effect) -> list[Content]:
     if one.interval is not None:
         rho += f" ({one.interval.low:.2f} to {one.interval.high:.2f})"
     eta = "" if one.eta_squared is None else f"{one.eta_squared:.2f}"
-    return [one.parameter, str(one.levels), f"{100 * one.strength:.0f} %", rho, eta]
+    return [one.parameter, str(one.levels), f"{max(0.0, 100 * one.strength):.0f} %", rho, eta]
 
 
 def _named(result: str) -> str:

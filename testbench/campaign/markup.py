@@ -53,5 +53,5 @@ def table(caption: str, head: Sequence[str], rows: Iterable[Sequence[Content]], 
         tag("tr", [cell("td", k, one) if k else cell("th", k, one, scope="row") for k, one in enumerate(row)])
         for row in rows
     ]
-    whole = tag("table", tag("caption", caption), tag("thead", heads), tag("tbody", body))
+    whole = tag("table", tag("caption", tag("span", caption)), tag("thead", heads), tag("tbody", body))
     return tag("div", whole, class_="scroll", tabindex="0", role="region", aria_label=caption)

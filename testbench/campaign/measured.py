@@ -5,12 +5,16 @@ from dataclasses import dataclass
 from typing import Final
 
 from testbench.campaign.axes import Axis
-from testbench.campaign.records import FAILURES, NO_STATEMENT, Point, RunRow
-from testbench.campaign.rule_specs import RUN_NUMBERS
-from testbench.campaign.rules import FAILURE, OUTCOMES, counts_as
+from testbench.campaign.records import FAILURES, NO_STATEMENT, Outcome, Point, RunRow
+from testbench.campaign.rule_specs import OUTCOMES, RUN_NUMBERS
+from testbench.campaign.statistics import outcomes_named
 
+FAILURE: Final = Outcome.FAILURE.value
+"""Where a share is named: any of the failures."""
 EXCEEDED: Final = "exceeded"
 """Any limit exceeded: an error or a failure."""
+BEYOND_3DEG: Final = "beyond_3deg"
+"""A joint beyond its range by more than 3 deg, because mechanical pins are soft."""
 
 _UNITS: Final = (("_rad_s", "rad/s"), ("_rad", "rad"), ("_nm", "N m"), ("_deg", "deg"), ("_rpm", "rpm"), ("_s", "s"))
 
@@ -45,7 +49,7 @@ def quantity(name: str) -> Quantity:
 
 def is_share(name: str) -> bool:
     """Whether a figure of that name shows a share of the runs: `failure`, or an outcome."""
-    return name in (FAILURE, *OUTCOMES)
+    return name in OUTCOMES
 
 
 def value_of(row: RunRow, name: str) -> float | None:
@@ -67,10 +71,13 @@ def stating(rows: Iterable[RunRow]) -> list[RunRow]:
 
 
 def count(rows: Iterable[RunRow], what: str) -> int:
-    """How many runs came out as named: `failure`, an outcome, or `exceeded`."""
+    """How many runs came out as named: `failure`, an outcome, `exceeded` or `beyond_3deg`."""
+    if what == BEYOND_3DEG:
+        return sum(row.failures_at_3deg > 0 for row in rows)
     if what == EXCEEDED:
         return sum(row.errors > 0 or row.failures > 0 or row.outcome in FAILURES for row in rows)
-    return sum(counts_as(row.outcome, what) for row in rows)
+    named = outcomes_named(what)
+    return sum(row.outcome in named for row in rows)
 
 
 def by_point(rows: Iterable[RunRow], points: Sequence[Point]) -> dict[Point, list[RunRow]]:

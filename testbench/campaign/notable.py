@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from typing import Final
 
 from testbench.campaign.measured import stating
-from testbench.campaign.records import NO_STATEMENT, Outcome, Point, RunRow
+from testbench.campaign.records import NO_STATEMENT, Point, RunRow
+from testbench.campaign.tables import words
 
 _EACH: Final = 5
 """Most runs of one kind."""
@@ -73,11 +74,6 @@ def _alone(runs: Mapping[Point, Sequence[RunRow]]) -> list[Notable]:
             found.append((len(judged), Notable(row, f"the other {len(judged) - 1} runs there: {words(common)}")))
     found.sort(key=lambda one: (-one[0], one[1].row.identity))
     return [notable for _, notable in found]
-
-
-def words(outcome: Outcome) -> str:
-    """An outcome as prose."""
-    return outcome.value.replace("_", " ")
 
 
 def _said(row: RunRow) -> str:

@@ -19,7 +19,7 @@ from testbench.campaign.figures import (
     share_figure,
 )
 from testbench.campaign.fits import QuadraticFit, quadratic_fit
-from testbench.campaign.markup import Content, Html, table, tag
+from testbench.campaign.markup import Html, table, tag
 from testbench.campaign.measured import (
     by_point,
     count,
@@ -33,8 +33,9 @@ from testbench.campaign.meta import Meta
 from testbench.campaign.records import RunRow
 from testbench.campaign.rules import Figure
 from testbench.campaign.samples import Summary, mean_interval, summary
-from testbench.campaign.sections import motion_note, number
+from testbench.campaign.sections import motion_note
 from testbench.campaign.statistics import Interval, NotEstimableError, wilson
+from testbench.campaign.tables import Table, number
 
 _MOST_PANELS: Final = 6
 _CURVE_POINTS: Final = 60
@@ -201,11 +202,7 @@ def fits_of(panel: Panel) -> Fits | None:
 
 def values_section(rows: Sequence[RunRow], meta: Meta) -> Html | None:
     """A table of each figure's numbers, the paper's beside ours; None when no figure shows a metric."""
-    tables = []
-    for panel in panels(rows, meta):
-        described = described_columns(panel) if not is_share(panel.wanted.y) else []
-        if described:
-            tables.append(_values_table(panel, described))
+    tables = [table(one.caption, one.heads, one.body, one.texts) for one in values_tables(rows, meta)]
     if not tables:
         return None
     note = "Mean with its 95 % interval; quartiles: a quarter of the runs below the first, a quarter above the second."
@@ -213,22 +210,19 @@ def values_section(rows: Sequence[RunRow], meta: Meta) -> Html | None:
     return tag("section", heading, *tables, tag("p", note, class_="note"), id="values")
 
 
-def _values_table(panel: Panel, described: Sequence[Described]) -> Html:
+def values_tables(rows: Sequence[RunRow], meta: Meta) -> list[Table]:
+    """One for each figure that shows a metric."""
+    shown = [panel for panel in panels(rows, meta) if not is_share(panel.wanted.y)]
+    return [_values_table(panel, described) for panel in shown if (described := described_columns(panel))]
+
+
+def _values_table(panel: Panel, described: Sequence[Described]) -> Table:
     paper = dict(panel.wanted.paper)
-    head = [
-        panel.x_label,
-        "runs",
-        "mean",
-        "median",
-        "quartiles",
-        "lowest",
-        "highest",
-        *(["the paper"] if paper else []),
-    ]
-    body: list[list[Content]] = []
+    heads = [panel.x_label, "runs", "mean", "median", "quartiles", "lowest", "highest"]
+    body = []
     for one in described:
         found = one.values
-        row: list[Content] = [
+        cells = [
             f"{one.x:g}",
             str(found.n),
             f"{number(found.mean)}{_ends(one.mean)}",
@@ -237,9 +231,10 @@ def _values_table(panel: Panel, described: Sequence[Described]) -> Html:
             number(found.low),
             number(found.high),
         ]
-        body.append([*row, f"{paper[one.x]:g}" if one.x in paper else ""] if paper else row)
+        body.append((*cells, *([f"{paper[one.x]:g}" if one.x in paper else ""] if paper else [])))
     unit = quantity(panel.wanted.y).unit
-    return table(f"{panel_title(panel)}{f', in {unit}' if unit else ''}", head, body, ())
+    caption = f"{panel_title(panel)}{f', in {unit}' if unit else ''}"
+    return Table(caption, (*heads, *(["the paper"] if paper else [])), tuple(body), frozenset())
 
 
 def _ends(interval: Interval | None) -> str:

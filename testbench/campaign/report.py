@@ -15,7 +15,8 @@ from testbench.campaign.markup import Html, tag
 from testbench.campaign.meta import Meta
 from testbench.campaign.plots import figure_section, values_section
 from testbench.campaign.records import NO_STATEMENT, RunRow
-from testbench.campaign.sections import headline, notable_runs, outcome_table
+from testbench.campaign.searched import search_section
+from testbench.campaign.sections import headline, notable_runs, outcome_section
 
 _STYLE: Final = "report.css"
 
@@ -34,10 +35,11 @@ def write_report(rows: Sequence[RunRow], meta: Meta, html_path: Path, junit_path
 
 def html_text(rows: Sequence[RunRow], meta: Meta) -> str:
     """The whole page; the same rows and meta give the same text."""
-    figures, _ = figure_section(rows, meta)
+    figures, drawn = figure_section(rows, meta)
     sections: list[tuple[str, str, Html | None]] = [
         ("figures", "Figures", figures),
-        ("outcomes", "Outcomes by point", outcome_table(rows, meta)),
+        ("search", "What was searched", search_section(rows, meta, drawn + 1)),
+        ("outcomes", "Outcomes by point", outcome_section(rows, meta)),
         ("values", "Numbers of the figures", values_section(rows, meta)),
         ("phase", "By gait phase", phase_section(rows)),
         ("ranking", "What matters", ranking_section(rows, meta)),
@@ -87,7 +89,7 @@ def _file(meta: Meta) -> Html:
 
 def _times(rows: Sequence[RunRow]) -> str:
     """Work of the runs, and what was taken over from golden runs."""
-    wall, cpu, forked = (sum(times) for times in zip(*((r.wall_s, r.cpu_s, r.forked_s) for r in rows), strict=True))
+    wall, cpu, forked = (sum(getattr(row, name) for row in rows) for name in ("wall_s", "cpu_s", "forked_s"))
     taken = f"; {forked:.0f} s of motion were taken over from golden runs" if forked else ""
     return f"the runs alone {wall:.0f} s, {cpu:.0f} s of processor time{taken}"
 

@@ -5,12 +5,11 @@ from collections.abc import Mapping, Sequence
 from typing import Final
 
 from testbench.campaign.markup import Content, Html, table, tag
-from testbench.campaign.measured import EXCEEDED, by_point, count, ended_early, stating, words_of
+from testbench.campaign.measured import EXCEEDED, FAILURE, by_point, count, ended_early, stating, words_of
 from testbench.campaign.meta import Meta
-from testbench.campaign.notable import Notable, latest_noticed, odd, replay_command, slowest, words, worst
+from testbench.campaign.notable import Notable, latest_noticed, odd, replay_command, slowest, worst
 from testbench.campaign.records import NO_STATEMENT, Outcome, RunRow
-from testbench.campaign.rules import FAILURE
-from testbench.campaign.statistics import wilson
+from testbench.campaign.tables import outcome_table, share_text, words
 
 _MOST_ROWS: Final = 240
 
@@ -27,19 +26,6 @@ COLOURS: Final = {
 """Of the bars; the same order as the outcomes, worst last and darkest."""
 
 
-def number(value: float) -> str:
-    """Three significant digits, without an exponent where it can be read without."""
-    return f"{value:.0f}" if 1000 <= abs(value) < 1e6 else f"{value:.3g}"
-
-
-def share_text(part: int, whole: int) -> str:
-    """`12 % (4 to 28 %)`: a share with its Wilson interval; none where there is nothing to take a share of."""
-    if not whole:
-        return "none"
-    interval = wilson(part, whole)
-    return f"{_percent(part / whole)} % ({_percent(interval.low)} to {_percent(interval.high)} %)"
-
-
 def headline(rows: Sequence[RunRow], meta: Meta) -> Html:
     """What was asked, how many runs there are, and how they came out."""
     judged = stating(rows)
@@ -51,8 +37,8 @@ def headline(rows: Sequence[RunRow], meta: Meta) -> Html:
     ]
     if mute:
         parts = ", ".join(f"{found} {words(outcome)}" for outcome, found in mute.items())
-        verb = "makes" if mute.total() == 1 else "make"
-        lines.append(f"{mute.total()} of them {verb} no statement ({parts}) and are in no share below. ")
+        makes, is_ = ("makes", "is") if mute.total() == 1 else ("make", "are")
+        lines.append(f"{mute.total()} of them {makes} no statement ({parts}) and {is_} in no share below. ")
     failing = count(judged, FAILURE)
     summary = tag(
         "p",
@@ -70,40 +56,28 @@ def headline(rows: Sequence[RunRow], meta: Meta) -> Html:
     return tag("section", tag("p", lines), summary, table("Outcomes of all runs", ("outcome", "runs", "share"), body))
 
 
-def outcome_table(rows: Sequence[RunRow], meta: Meta) -> Html:
-    """A row a point: outcomes, shares of failures and exceeded limits, reactions, what makes no statement."""
-    runs = by_point(rows, meta.points)
-    seen = [outcome for outcome in Outcome if any(row.outcome is outcome for row in rows)]
-    judged_seen = [outcome for outcome in seen if outcome not in NO_STATEMENT]
-    mute = bool(set(seen) & NO_STATEMENT)
-    axes = [axis.name for axis in meta.axes]
-    head = [*axes, "runs", "outcomes", *(words(one) for one in judged_seen), "failed", "any limit exceeded", "noticed"]
-    body = []
-    for point, found in list(runs.items())[:_MOST_ROWS]:
-        judged = stating(found)
-        values = dict(point.parameters)
-        cells: list[Content] = [values.get(axis, "") for axis in axes]
-        cells += [str(len(judged)), bar(judged)]
-        cells += [str(sum(row.outcome is outcome for row in judged)) for outcome in judged_seen]
-        cells += [share_text(count(judged, what), len(judged)) for what in (FAILURE, EXCEEDED)]
-        cells.append(_noticed(judged))
-        if mute:
-            cells.append(_mute(found))
-        body.append(cells)
-    if mute:
-        head.append("no statement")
+def outcome_section(rows: Sequence[RunRow], meta: Meta) -> Html:
+    """Outcomes by point, each with a bar."""
+    counted = outcome_table(rows, meta)
+    at = len(meta.axes) + 1
+    runs = list(by_point(rows, meta.points).values())
+    body: list[list[Content]] = [
+        [*cells[:at], bar(stating(found)), *cells[at:]]
+        for cells, found in list(zip(counted.body, runs, strict=True))[:_MOST_ROWS]
+    ]
+    texts = {column + (column >= at) for column in counted.texts} | {at}
+    shown = table(counted.caption, [*counted.heads[:at], "outcomes", *counted.heads[at:]], body, texts)
     left_out = len(runs) - len(body)
-    note = f"{left_out} further points are in the export of the store." if left_out > 0 else ""
-    texts = [*range(len(axes)), len(axes) + 1, *([len(head) - 1] if mute else [])]
-    shown = table("Outcomes by point", head, body, texts)
+    note = f" {left_out} further points are in the export of the store." if left_out > 0 else ""
     explained = tag(
         "p",
         "Shares are over the runs that make a statement; in brackets the Wilson interval at 95 %. A limit is exceeded "
         "when a torque, a speed or an angle is beyond it. Noticed: drive or controller reacted after the first fault "
-        f"began; the median time it took them. {note}",
+        f"began; the median time it took them.{note}",
         class_="note",
     )
-    return tag("section", tag("h2", "Outcomes by point"), _legend(judged_seen), shown, explained, id="outcomes")
+    seen = [outcome for outcome in COLOURS if any(row.outcome is outcome for row in rows)]
+    return tag("section", tag("h2", "Outcomes by point"), _legend(seen), shown, explained, id="outcomes")
 
 
 def notable_runs(rows: Sequence[RunRow], meta: Meta) -> Html:
@@ -138,23 +112,6 @@ def motion_note(rows: Sequence[RunRow]) -> str:
     return (
         f" {early} run{_s(early)} ended early: {'its' if early == 1 else 'their'} numbers cover a part of the motion."
     )
-
-
-def _percent(share: float) -> str:
-    return f"{100 * share:.0f}" if share in (0, 1) else f"{100 * share:.1f}"
-
-
-def _noticed(rows: Sequence[RunRow]) -> str:
-    latencies = sorted(row.detection_latency_s for row in rows if row.detection_latency_s is not None)
-    if not latencies:
-        return "0"
-    middle = (latencies[(len(latencies) - 1) // 2] + latencies[len(latencies) // 2]) / 2
-    return f"{len(latencies)}, {middle:.3f} s"
-
-
-def _mute(rows: Sequence[RunRow]) -> str:
-    counts = Counter(row.outcome for row in rows if row.outcome in NO_STATEMENT)
-    return ", ".join(f"{found} {words(outcome)}" for outcome, found in counts.items())
 
 
 def bar(rows: Sequence[RunRow]) -> Html:
