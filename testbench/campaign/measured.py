@@ -6,7 +6,8 @@ from typing import Final
 
 from testbench.campaign.axes import Axis
 from testbench.campaign.records import FAILURES, NO_STATEMENT, Outcome, Point, RunRow
-from testbench.campaign.rule_specs import OUTCOMES, RUN_NUMBERS
+from testbench.campaign.rule_specs import RUN_NUMBERS
+from testbench.campaign.rules import OUTCOMES
 from testbench.campaign.statistics import outcomes_named
 
 FAILURE: Final = Outcome.FAILURE.value

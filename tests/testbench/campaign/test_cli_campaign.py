@@ -87,7 +87,8 @@ def is_alive(process: int) -> bool:
 @pytest.fixture
 def fake(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
     """Have this process's pools make runs by a function of tests.testbench.campaign.workers."""
-    return lambda maker: monkeypatch.setattr(testbench.campaign.pool.Pool.__init__, "__defaults__", (f"{HERE}:{maker}",))
+    made = testbench.campaign.pool.Pool.__init__
+    return lambda maker: monkeypatch.setattr(made, "__defaults__", (f"{HERE}:{maker}",))
 
 
 def test_run_prints_a_table_and_says_where_it_is(
@@ -116,7 +117,8 @@ def test_json_is_one_document(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     """Of run and of status: counts, points, shares."""
     fake("quick")
     store = str(tmp_path / "s.sqlite")
-    assert main(["campaign", "run", str(written(tmp_path)), "--out", store, "--runs", "4", "--json", "--no-report"]) == 0
+    options = ["--out", store, "--runs", "4", "--json", "--no-report"]
+    assert main(["campaign", "run", str(written(tmp_path)), *options]) == 0
     document = json.loads(capsys.readouterr().out)
     assert (document["campaign"], document["done"], document["wanted"], document["made"]) == ("small", 8, 8, 8)
     assert sum(document["outcomes"].values()) == 8

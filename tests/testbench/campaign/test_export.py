@@ -71,7 +71,7 @@ def test_injections_are_a_table_of_their_own() -> None:
 def test_place_that_cannot_be_written_is_said(tmp_path: Path) -> None:
     """And nothing is left there."""
     (tmp_path / "file").touch()
-    with pytest.raises(BenchError, match="cannot be written: .*give another place"):
+    with pytest.raises(BenchError, match=r"cannot be written: .*give another place"):
         write_csv(run_table(ROWS), tmp_path / "file" / "runs.csv")
     (tmp_path / "folder").mkdir()
     with pytest.raises(BenchError, match="cannot be written"):

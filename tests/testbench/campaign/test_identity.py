@@ -9,6 +9,7 @@ from testbench.errors import BenchError
 def test_everything_that_changes_a_run_changes_its_identity() -> None:
     """Fixed here, so that a change of the rule itself is seen; it would make every store start anew."""
     base = ("name: a\nseed: 0\n", 1, "0.1.0+0", "failure", 0.25)
+    others: list[tuple[str, int, str, str | None, float]]
     others = [("name: b\nseed: 0\n", *base[1:]), (base[0], 2, *base[2:]), (*base[:2], "0.1.0+1", *base[3:])]
     others += [(*base[:3], None, 0.25), (*base[:4], 0.5)]
     names = [identity(*given) for given in (base, *others)]

@@ -138,7 +138,8 @@ def test_runs_of_another_version_are_made_anew(store: Store) -> None:
 def test_run_is_known_by_what_it_is_not_by_its_name(store: Store) -> None:
     """An axis with another name, and a value written in another unit: the same runs, under their new names."""
     run(small(), store)
-    renamed = small(("  duration:\n    set", "  length:\n    set"), ("values: [0.05 s, 0.3 s]", "values: [50 ms, 300 ms]"))
+    units = ("values: [0.05 s, 0.3 s]", "values: [50 ms, 300 ms]")
+    renamed = small(("  duration:\n    set", "  length:\n    set"), units)
     _, specs = run(renamed, store)
     assert specs == []
     assert {row.point.parameters for row in store.rows()} == {(("length", "50 ms"),), (("length", "300 ms"),)}
@@ -194,7 +195,7 @@ def test_rows_are_the_same_in_whatever_order_runs_finish(store: Store, tmp_path:
 
 def test_failing_executor_keeps_what_was_made(store: Store) -> None:
     """An error in the middle: the processes are stopped, the rows stay."""
-    made = []
+    made: list[RunSpec] = []
 
     def make(spec: RunSpec) -> RunRow:
         if len(made) == 2:

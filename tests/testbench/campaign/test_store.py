@@ -221,7 +221,7 @@ def test_what_is_no_store_is_left_alone(tmp_path: Path) -> None:
         assert before is None or path.read_bytes() == before
     with pytest.raises(StoreError, match="no such file; `exo-hil campaign run` makes it"):
         open_store(tmp_path / "nothing.sqlite")
-    with pytest.raises(StoreError, match="Not a directory|File exists"):
+    with pytest.raises(StoreError, match=r"Not a directory|File exists"):
         open_store(text / "store.sqlite", write=True)
 
 
