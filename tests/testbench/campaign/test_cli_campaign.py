@@ -51,7 +51,7 @@ def exo_hil(folder: Path, *arguments: str, maker: str = "") -> subprocess.Popen[
 def rows_in(path: Path) -> list[RunRow]:
     store = open_store(path)
     try:
-        return [dataclasses.replace(row, **TIMES) for row in store.rows()]  # type: ignore[arg-type]
+        return [dataclasses.replace(row, **TIMES) for row in store.runs.all()]  # type: ignore[arg-type]
     finally:
         store.close()
 
@@ -251,6 +251,10 @@ def test_ctrl_c_keeps_what_was_made_and_leaves_nobody(tmp_path: Path) -> None:
     process = exo_hil(tmp_path, *arguments, maker="hangs_from_3")
     once(process, lambda: has_rows(store, 3) and len(worker_numbers(tmp_path)) == 2)
     process.send_signal(signal.SIGINT)
+    assert process.stderr is not None
+    for line in process.stderr:
+        if "Ctrl-C again drops them" in line:
+            break
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=60)
     if process.poll() is None or process.returncode != 130:

@@ -68,7 +68,7 @@ def run(
 
 
 def rows_of(store: Store) -> list[RunRow]:
-    return [dataclasses.replace(row, wall_s=0.0) for row in store.rows()]
+    return [dataclasses.replace(row, wall_s=0.0) for row in store.runs.all()]
 
 
 def test_every_wanted_run_is_made_once(store: Store) -> None:
@@ -76,7 +76,7 @@ def test_every_wanted_run_is_made_once(store: Store) -> None:
     finished, specs = run(small(), store)
     assert (finished.progress.done, finished.progress.wanted, finished.interrupted) == (6, 6, False)
     assert len({spec.identity for spec in specs}) == 6
-    assert [(dict(row.point.parameters)["duration"], row.number, row.seed) for row in store.rows()] == [
+    assert [(dict(row.point.parameters)["duration"], row.number, row.seed) for row in store.runs.all()] == [
         *(("0.05 s", 0, 5), ("0.05 s", 1, 6), ("0.05 s", 2, 7)),
         *(("0.3 s", 0, 5), ("0.3 s", 1, 6), ("0.3 s", 2, 7)),
     ]
@@ -89,27 +89,27 @@ def test_every_wanted_run_is_made_once(store: Store) -> None:
 def test_running_again_makes_nothing(store: Store) -> None:
     """What the store has is never made again."""
     run(small(), store)
-    before = store.rows()
+    before = store.runs.all()
     finished, specs = run(small(), store)
     assert specs == []
     assert finished.reused == 6
-    assert store.rows() == before
+    assert store.runs.all() == before
 
 
 def test_interrupted_campaign_goes_on_and_ends_with_the_same_rows(store: Store, tmp_path: Path) -> None:
     """Ctrl-C after some runs: runs in flight are taken in, the rest is made the next time, nothing twice."""
     finished, first = run(small(), store, stop_after=2)
     assert finished.interrupted
-    assert 2 <= len(store.rows()) < 6
-    assert store.invocations()[-1].how == "interrupted"
-    kept = {row.identity for row in store.rows()}
+    assert 2 <= len(store.runs.all()) < 6
+    assert store.invocations.all()[-1].how == "interrupted"
+    kept = {row.identity for row in store.runs.all()}
     assert kept == {spec.identity for spec in first}
     finished, second = run(small(), store)
     assert kept.isdisjoint(spec.identity for spec in second)
     whole = open_store(tmp_path / "whole.sqlite", write=True)
     run(small(), whole)
     assert rows_of(store) == rows_of(whole)
-    assert [one.how for one in store.invocations()] == ["interrupted", "done"]
+    assert [one.how for one in store.invocations.all()] == ["interrupted", "done"]
     whole.close()
 
 
@@ -119,11 +119,11 @@ def test_changed_file_adds_what_is_new_and_counts_what_it_wants(store: Store) ->
     finished, specs = run(small(("values: [0.05 s, 0.3 s]", "values: [0.3 s, 0.5 s]"), ("runs: 3", "runs: 4")), store)
     assert finished.reused == 3
     assert len(specs) == 5
-    assert len(store.rows()) == 8
-    assert {dict(row.point.parameters)["duration"] for row in store.rows()} == {"0.3 s", "0.5 s"}
-    assert store.others() == {"v1": 3}
+    assert len(store.runs.all()) == 8
+    assert {dict(row.point.parameters)["duration"] for row in store.runs.all()} == {"0.3 s", "0.5 s"}
+    assert store.runs.others() == {"v1": 3}
     run(small(), store)
-    assert len(store.rows()) == 6
+    assert len(store.runs.all()) == 6
 
 
 def test_runs_of_another_version_are_made_anew(store: Store) -> None:
@@ -131,8 +131,8 @@ def test_runs_of_another_version_are_made_anew(store: Store) -> None:
     run(small(), store)
     finished, specs = run(small(), store, way=dataclasses.replace(WAY, version="v2"))
     assert (finished.reused, len(specs)) == (0, 6)
-    assert len(store.rows()) == 6
-    assert store.others() == {"v1": 6}
+    assert len(store.runs.all()) == 6
+    assert store.runs.others() == {"v1": 6}
 
 
 def test_run_is_known_by_what_it_is_not_by_its_name(store: Store) -> None:
@@ -142,7 +142,7 @@ def test_run_is_known_by_what_it_is_not_by_its_name(store: Store) -> None:
     renamed = small(("  duration:\n    set", "  length:\n    set"), units)
     _, specs = run(renamed, store)
     assert specs == []
-    assert {row.point.parameters for row in store.rows()} == {(("length", "50 ms"),), (("length", "300 ms"),)}
+    assert {row.point.parameters for row in store.runs.all()} == {(("length", "50 ms"),), (("length", "300 ms"),)}
 
 
 def test_early_stop_makes_another_run() -> None:
@@ -209,7 +209,7 @@ def test_failing_executor_keeps_what_was_made(store: Store) -> None:
     with pytest.raises(RuntimeError, match="power failure"):
         runner.run(executor, lambda progress: None, lambda: 0)
     assert executor.is_stopped
-    assert len(store.rows()) == 2
+    assert len(store.runs.all()) == 2
 
 
 def test_progress_tells_rate_and_time_left() -> None:

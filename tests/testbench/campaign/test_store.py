@@ -61,29 +61,30 @@ def full_row() -> RunRow:
 def test_row_comes_back_as_it_was_kept(store: Store, path: Path) -> None:
     """Every field, and the activations in their order, also through another connection."""
     row = full_row()
-    store.append(row, RECIPE)
-    assert store.rows() == [row]
+    store.runs.append(row, RECIPE)
+    assert store.runs.all() == [row]
     reader = open_store(path)
-    assert reader.rows() == [row]
-    assert reader.recipe(row.identity) == RECIPE
+    assert reader.runs.all() == [row]
+    assert reader.runs.recipe(row.identity) == RECIPE
     reader.close()
 
 
 def test_rows_come_by_point_and_number(store: Store) -> None:
     """Points in the order in which they were given, whatever order the runs finished in."""
     points = [spec(0, axis=axis).wanted.point for axis in ("0.2 s", "0.1 s")]
-    store.add_points(points)
+    store.points.add(points)
     for number, axis in ((1, "0.1 s"), (0, "0.2 s"), (0, "0.1 s")):
-        store.append(row_of(spec(number, axis=axis)), RECIPE)
-    assert [(row.point, row.number) for row in store.rows()] == [(points[0], 0), (points[1], 0), (points[1], 1)]
-    assert store.points() == {1: points[0], 2: points[1]}
+        store.runs.append(row_of(spec(number, axis=axis)), RECIPE)
+    assert [(row.point, row.number) for row in store.runs.all()] == [(points[0], 0), (points[1], 0), (points[1], 1)]
+    assert store.points.all() == {1: points[0], 2: points[1]}
 
 
 def test_parameters_are_kept_in_si_as_well(store: Store) -> None:
     """Table parameters: as written, SI value and unit; a word has no value."""
     point = Point((("duration", "50 ms"), ("angle", "90 deg"), ("share", "20 %"), ("count", "3"), ("stops", "off")))
-    store.add_points([point])
-    found = store.connection.execute("SELECT axis, written, value, unit FROM parameters ORDER BY axis").fetchall()
+    store.points.add([point])
+    asked = "SELECT axis, written, value, unit FROM parameters ORDER BY axis"
+    found = store.database.connection.execute(asked).fetchall()
     assert found == [
         ("angle", "90 deg", pytest.approx(1.5707963267948966), "rad"),
         ("count", "3", 3.0, ""),
@@ -96,33 +97,33 @@ def test_parameters_are_kept_in_si_as_well(store: Store) -> None:
 def test_same_identity_is_kept_once(store: Store) -> None:
     """A run that is made again takes the place of the one before, its activations too."""
     row = row_of(spec(1))
-    store.append(row, RECIPE)
+    store.runs.append(row, RECIPE)
     again = dataclasses.replace(row, wall_s=9.0, injections=row.injections[:1])
-    store.append(again, RECIPE)
-    assert store.rows() == [again]
-    assert store.connection.execute("SELECT count(*) FROM injections").fetchone() == (1,)
+    store.runs.append(again, RECIPE)
+    assert store.runs.all() == [again]
+    assert store.database.connection.execute("SELECT count(*) FROM injections").fetchone() == (1,)
 
 
 def test_runs_that_are_not_wanted_stay_and_do_not_count(store: Store) -> None:
     """want: those named count, at the place named; all others are told by their version."""
     rows = [row_of(spec(number)) for number in range(3)]
     for row in rows:
-        store.append(row, RECIPE)
+        store.runs.append(row, RECIPE)
     elsewhere = Point((("axis", "2"),))
-    store.want({rows[1].identity: (elsewhere, 7)})
-    assert store.rows() == [dataclasses.replace(rows[1], point=elsewhere, number=7)]
-    assert len(store.rows(wanted=False)) == 3
-    assert store.others() == {"1": 2}
-    assert store.rows("2", wanted=False) == []
+    store.runs.want({rows[1].identity: (elsewhere, 7)})
+    assert store.runs.all() == [dataclasses.replace(rows[1], point=elsewhere, number=7)]
+    assert len(store.runs.all(wanted=False)) == 3
+    assert store.runs.others() == {"1": 2}
+    assert store.runs.all(code_version="2", wanted=False) == []
 
 
 def test_runs_can_be_read_while_others_are_written(store: Store, path: Path) -> None:
     """WAL: a reader in the middle of a read sees one moment, and hinders no writer."""
-    store.append(row_of(spec(0)), RECIPE)
+    store.runs.append(row_of(spec(0)), RECIPE)
     reader = sqlite3.connect(path)
     reader.execute("BEGIN")
     assert reader.execute("SELECT count(*) FROM results").fetchone() == (1,)
-    store.append(row_of(spec(1)), RECIPE)
+    store.runs.append(row_of(spec(1)), RECIPE)
     assert reader.execute("SELECT count(*) FROM results").fetchone() == (1,)
     reader.rollback()
     assert reader.execute("SELECT count(*) FROM results").fetchone() == (2,)
@@ -145,7 +146,7 @@ def fill(store: Store, most: int = 100_000) -> tuple[int, str]:
     """Append until it fails: how many rows were kept, and what was said."""
     for number in range(most):
         try:
-            store.append(row_of(spec(number)), RECIPE)
+            store.runs.append(row_of(spec(number)), RECIPE)
         except StoreError as error:
             return number, str(error)
     raise AssertionError("it never failed")
@@ -153,18 +154,18 @@ def fill(store: Store, most: int = 100_000) -> tuple[int, str]:
 
 def test_full_disk_is_said_and_what_was_written_is_kept(store: Store, path: Path) -> None:
     """Nothing half-written; the store opens afterwards, with every row, and goes on when there is room."""
-    pages = store.connection.execute("PRAGMA page_count").fetchone()[0]
-    store.connection.execute(f"PRAGMA max_page_count = {pages + 20}")
+    pages = store.database.connection.execute("PRAGMA page_count").fetchone()[0]
+    store.database.connection.execute(f"PRAGMA max_page_count = {pages + 20}")
     kept, said = fill(store)
     assert kept > 1
     assert "the disk is full; make room and start again" in said
     assert str(path) in said
-    assert len(store.rows()) == kept
+    assert len(store.runs.all()) == kept
     store.close()
     again = open_store(path, write=True)
-    assert len(again.rows()) == kept
-    again.append(row_of(spec(kept)), RECIPE)
-    assert again.rows() == [row_of(spec(number)) for number in range(kept + 1)]
+    assert len(again.runs.all()) == kept
+    again.runs.append(row_of(spec(kept)), RECIPE)
+    assert again.runs.all() == [row_of(spec(number)) for number in range(kept + 1)]
     again.close()
 
 
@@ -189,8 +190,8 @@ def test_file_that_may_not_grow_is_said_and_opens_afterwards(path: Path) -> None
     assert resource.getrlimit(resource.RLIMIT_FSIZE)[0] != 300_000
     assert "make room and start again" in said
     store = open_store(path, write=True)
-    assert store.rows() == [row_of(spec(number)) for number in range(int(kept))]
-    assert store.connection.execute("PRAGMA integrity_check").fetchone() == ("ok",)
+    assert store.runs.all() == [row_of(spec(number)) for number in range(int(kept))]
+    assert store.database.connection.execute("PRAGMA integrity_check").fetchone() == ("ok",)
     store.close()
 
 
@@ -229,16 +230,16 @@ def test_outcomes_are_forgotten_on_request(store: Store) -> None:
     """What crashed or hung can be made again; other versions keep theirs."""
     outcomes = (Outcome.CRASHED, Outcome.MASKED, Outcome.HANG, Outcome.INVALID)
     for number, outcome in enumerate(outcomes):
-        store.append(row_of(spec(number), outcome), RECIPE)
-    store.append(row_of(spec(9), Outcome.HANG), dataclasses.replace(RECIPE, code_version="0"))
-    assert store.remove((Outcome.CRASHED, Outcome.HANG), "1") == 2
-    assert [row.number for row in store.rows()] == [1, 3, 9]
+        store.runs.append(row_of(spec(number), outcome), RECIPE)
+    store.runs.append(row_of(spec(9), Outcome.HANG), dataclasses.replace(RECIPE, code_version="0"))
+    assert store.runs.forget((Outcome.CRASHED, Outcome.HANG), "1") == 2
+    assert [row.number for row in store.runs.all()] == [1, 3, 9]
 
 
 def test_invocations_are_noted(store: Store) -> None:
     """Who ran when, with how many processes, and how it ended."""
     begun = Invocation("t0", "", 0.0, 2, 0, "here", "1", "exo-hil campaign run x.yaml", "running")
-    number = store.begin(begun)
-    assert store.invocations() == [begun]
-    store.end(number, "t1", 2.5, 7, "done")
-    assert store.invocations() == [dataclasses.replace(begun, ended="t1", wall_s=2.5, made=7, how="done")]
+    number = store.invocations.begin(begun)
+    assert store.invocations.all() == [begun]
+    store.invocations.note(number, "t1", 2.5, 7, "done")
+    assert store.invocations.all() == [dataclasses.replace(begun, ended="t1", wall_s=2.5, made=7, how="done")]
