@@ -211,8 +211,8 @@ def test_a_run_that_failed_ends_after_the_grace_time_forked_or_not(grace_s: floa
 
 def test_an_early_stop_changes_nothing_about_a_run_that_does_not_fail(workshop: Workshop) -> None:
     """Neither its frames nor its numbers."""
-    whole, watched = (make_run(spec("bit_flip", SHORT, "injectors.flipped_bit.event.time=1 s", fork=True, grace_s=grace),
-                               workshop) for grace in (None, 0.0))  # fmt: skip
+    inside = ("bit_flip", SHORT, "injectors.flip_position.event.time=1 s")
+    whole, watched = (make_run(spec(*inside, fork=True, grace_s=grace), workshop) for grace in (None, 0.0))
     assert whole.failures == 0
     assert timeless(whole) == timeless(watched)
 
