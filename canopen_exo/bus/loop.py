@@ -56,20 +56,29 @@ class Loop:
             rows.append(Transmission(self._ends[at], sender.medium.index, frame, sender.number))
         return rows
 
-    def recall(self, rows: list[Transmission]) -> None:
-        """For a copy, whose trace is empty: the rows that the original had then; to be called before anything runs."""
+    def forget(self) -> None:
+        """Leave the trace so far to somebody else who has it, and may give it back (`resume`)."""
+        self._rows.clear()
+        self._ends.clear()
+        self._passed.clear()
+        self._recalled = 0
+
+    def resume(self, rows: list[Transmission]) -> None:
+        """Of a copy that has forgotten: the trace so far. Nodes that have taken another one's place are heard."""
         self._rows.extend(rows)
         self._recalled = len(rows)
+        for medium in self.media:
+            self._listen(medium)
 
     def __deepcopy__(self, memo: dict[int, object]) -> "Loop":
-        """The same state between two instants: media with what waits on them, nodes. The trace is left behind."""
+        """The same state between two instants; the rows of the trace are shared."""
         twin = Loop(copy.deepcopy(self.media, memo))
         memo[id(self)] = twin
         twin.nodes = copy.deepcopy(self.nodes, memo)
         twin.outs = copy.deepcopy(self.outs, memo)
         twin.now = self.now
-        for medium in twin.media:  # afresh, with the filters of the nodes that are there now
-            twin._listen(medium)
+        twin._rows.extend(self.trace)
+        twin._recalled = len(twin._rows)
         return twin
 
     def connect(self, node: Node, media: list[Medium]) -> None:

@@ -96,7 +96,7 @@ class Trunk:
         self._show(gateway, snapshot.now, until_active=False)
         gateway.frames[:] = snapshot.frames
         rig = copy.deepcopy(trunk, {**_shared(trunk), id(trunk.gateway): gateway})
-        rig.loop.recall(self._rows[: snapshot.rows])
+        rig.loop.resume(self._rows[: snapshot.rows])
         rig.rack.truth.extend(self._truth[: snapshot.truth])
         rig.controller.samples.extend(self._samples[: snapshot.samples])
         return rig
@@ -157,6 +157,7 @@ def _snapshot(rig: Rig, digest: TraceHash, hashed: int) -> Snapshot:
     truth, samples = rig.rack.truth, rig.controller.samples
     left: dict[int, object] = {id(truth): [], id(samples): [], id(rig.gateway): rig.gateway}
     twin = copy.deepcopy(rig, {**_shared(rig), **left})
+    twin.loop.forget()
     to_drives, to_controller = rig.gateway.frames
     return Snapshot(
         rig.loop.now, twin, (to_drives, to_controller), len(rows), len(truth), len(samples), digest.copy()
