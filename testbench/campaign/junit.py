@@ -10,9 +10,10 @@ from collections.abc import Sequence
 from typing import Final
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
-from testbench.campaign.measured import EXCEEDED, FAILURE, by_point, count, stating, words_of
+from testbench.campaign.measured import EXCEEDED, by_point, count, stating, words_of
 from testbench.campaign.meta import Meta
 from testbench.campaign.records import NO_STATEMENT, Outcome, RunRow
+from testbench.campaign.rules import FAILURE
 from testbench.campaign.statistics import wilson
 
 _NOT_XML: Final = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")

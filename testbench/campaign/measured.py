@@ -5,12 +5,11 @@ from dataclasses import dataclass
 from typing import Final
 
 from testbench.campaign.axes import Axis
-from testbench.campaign.records import FAILURES, NO_STATEMENT, Outcome, Point, RunRow
-from testbench.campaign.rule_specs import OUTCOMES, RUN_NUMBERS
+from testbench.campaign.records import FAILURES, NO_STATEMENT, Point, RunRow
+from testbench.campaign.rule_specs import RUN_NUMBERS
+from testbench.campaign.rules import OUTCOMES
 from testbench.campaign.statistics import outcomes_named
 
-FAILURE: Final = Outcome.FAILURE.value
-"""Where a share is named: any of the failures."""
 EXCEEDED: Final = "exceeded"
 """Any limit exceeded: an error or a failure."""
 BEYOND_3DEG: Final = "beyond_3deg"

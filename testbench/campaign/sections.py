@@ -5,10 +5,11 @@ from collections.abc import Mapping, Sequence
 from typing import Final
 
 from testbench.campaign.markup import Content, Html, table, tag
-from testbench.campaign.measured import EXCEEDED, FAILURE, by_point, count, ended_early, stating, words_of
+from testbench.campaign.measured import EXCEEDED, by_point, count, ended_early, stating, words_of
 from testbench.campaign.meta import Meta
 from testbench.campaign.notable import Notable, latest_noticed, odd, replay_command, slowest, worst
 from testbench.campaign.records import NO_STATEMENT, Outcome, RunRow
+from testbench.campaign.rules import FAILURE
 from testbench.campaign.tables import outcome_table, share_text, words
 
 _MOST_ROWS: Final = 240

@@ -5,9 +5,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from testbench.campaign.measured import BEYOND_3DEG, EXCEEDED, FAILURE, by_point, count, stating
+from testbench.campaign.measured import BEYOND_3DEG, EXCEEDED, by_point, count, stating
 from testbench.campaign.meta import Meta
 from testbench.campaign.records import NO_STATEMENT, Outcome, RunRow
+from testbench.campaign.rules import FAILURE
 from testbench.campaign.statistics import wilson
 
 SHARES: Final = {
