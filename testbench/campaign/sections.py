@@ -52,12 +52,12 @@ def headline(rows: Sequence[RunRow], meta: Meta) -> Html:
         f"{over}. In {count(judged, EXCEEDED)} runs a limit of torque, speed or angle was exceeded.",
     )
     counts = Counter(row.outcome for row in rows)
-    heads = ("outcome", "runs", *([] if is_search(meta) else ["share"]))
-    body: list[list[Content]] = [
-        [_swatch(outcome), str(counts[outcome]), _share_of_all(outcome, counts[outcome], len(judged))][: len(heads)]
-        for outcome in Outcome
-        if counts[outcome]
-    ]
+    heads = ["outcome", "runs"]
+    body: list[list[Content]] = [[_swatch(outcome), str(counts[outcome])] for outcome in Outcome if counts[outcome]]
+    if not is_search(meta):
+        heads.append("share")
+        for cells, outcome in zip(body, (one for one in Outcome if counts[one]), strict=True):
+            cells.append(_share_of_all(outcome, counts[outcome], len(judged)))
     return tag("section", tag("p", lines), summary, table("Outcomes of all runs", heads, body))
 
 
