@@ -186,8 +186,9 @@ def flow_text(data: Data) -> str:
                 return data
         except FileErrors:
             pass
-    form = {"sort_keys": False, "allow_unicode": True, "width": math.inf, "default_flow_style": True}
-    text: str = yaml.dump(data, Dumper=_Dumper, **form)
+    text: str = yaml.dump(
+        data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=math.inf, default_flow_style=True
+    )
     return text.removesuffix("...\n").strip()
 
 

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from testbench.campaign.runner import Finished
     from testbench.campaign.schema import Campaign
     from testbench.campaign.store import Store
+    from testbench.process import Orders
 
 INTERRUPTED: Final = 130
 
@@ -145,12 +146,12 @@ def _run(options: argparse.Namespace, show: Callable[[str], None]) -> int:
     try:
         remember(store, campaign)
         if options.retry:
-            store.remove((Outcome.CRASHED, Outcome.HANG), version)
+            store.runs.forget((Outcome.CRASHED, Outcome.HANG), version)
         runner = Runner(campaign, store, way)
         with Orders().taken() as orders, shown(campaign.name) as watch:
             runner.prepare()
-            finished = runner.run(Pool(jobs), watch, lambda: orders.count)
-        rows = store.rows()
+            finished = runner.run(Pool(jobs), watch, _stopping(orders))
+        rows = store.runs.all(brief=True)
         show(_run_json(campaign, store, rows, finished) if options.json else _run_text(store, rows, finished))
         if finished.interrupted:
             _say(f"interrupted; the same command goes on from here: {len(rows)} runs are in {path}")
@@ -168,6 +169,19 @@ def _default_store(name: str, overrides: list[str]) -> Path:
     return Path("results") / "campaigns" / f"{name}{changes}.sqlite"
 
 
+def _stopping(orders: "Orders") -> Callable[[], int]:
+    """How often the user has asked to stop; says what comes of it when he first does."""
+    told: list[str] = []
+
+    def count() -> int:
+        if orders.count and not told:
+            told.append("stopping: no run is begun any more, those in flight get 10 s; Ctrl-C again drops them")
+            _say(told[0])
+        return orders.count
+
+    return count
+
+
 def _cores() -> int:
     """Cores that this process may use."""
     return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
@@ -182,7 +196,7 @@ def _run_text(store: "Store", rows: "list[RunRow]", finished: "Finished") -> str
     from testbench.campaign.words import point_lines, time_text
 
     far = finished.progress
-    lines = point_lines(store.points(), rows)
+    lines = point_lines(store.points.all(), rows)
     rate = f"{far.per_minute:.1f} runs/min" if far.made else "nothing was missing"
     lines.append(f"{far.done} of {far.wanted} runs; {far.made} made in {time_text(far.elapsed_s)} ({rate})")
     return "\n".join([*lines, *_asides(store, rows), f"store: {store.path}"]) + "\n"
@@ -192,8 +206,8 @@ def _asides(store: "Store", rows: "list[RunRow]") -> list[str]:
     """What does not count, and why."""
     from testbench.campaign.words import odd_lines
 
-    lines = odd_lines(rows, store.points())
-    for version, count in store.others().items():
+    lines = odd_lines(rows, store.points.all())
+    for version, count in store.runs.others().items():
         lines.append(f"not counted: {count} runs of version {version} that the campaign as run last does not want")
     return lines
 
@@ -221,7 +235,7 @@ def _counts(store: "Store", rows: "list[RunRow]") -> dict[str, object]:
         "store": str(store.path),
         "done": len(rows),
         "outcomes": {name: count for name, count in counts.items() if count},
-        "not_counted": store.others(),
+        "not_counted": store.runs.others(),
     }
 
 
@@ -234,7 +248,7 @@ def _points(store: "Store", rows: "list[RunRow]") -> list[dict[str, object]]:
     for row in rows:
         found.setdefault(row.point, []).append(row.outcome)
     entries: list[dict[str, object]] = []
-    for number, point in store.points().items():
+    for number, point in store.points.all().items():
         outcomes = found.get(point, [])
         if not outcomes:
             continue
@@ -260,7 +274,7 @@ def _status(options: argparse.Namespace, show: Callable[[str], None]) -> int:
 
     store = open_store(options.store)
     try:
-        rows, made = store.rows(), store.invocations()
+        rows, made = store.runs.all(brief=True), store.invocations.all()
         wanted = int(store.meta("wanted") or len(rows))
         last = made[-1] if made else None
         rate = 60 * last.made / last.wall_s if last is not None and last.wall_s > 0 else 0.0
@@ -334,7 +348,7 @@ def _export(options: argparse.Namespace, show: Callable[[str], None]) -> int:
         raise BenchError("export: where to? give --csv FILE, --parquet FILE, or both")
     store = open_store(options.store)
     try:
-        rows = store.rows(wanted=not options.all)
+        rows = store.runs.all(wanted=not options.all)
     finally:
         store.close()
     table = injection_table(rows) if options.injections else run_table(rows)

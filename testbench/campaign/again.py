@@ -48,15 +48,15 @@ class Again:
 
 def find_run(store: Store, name: str) -> RunRow:
     """The run of a name: POINT/NUMBER, or the first letters of its identity. Raises BenchError."""
-    rows = store.rows(wanted=False)
+    rows = store.runs.all(wanted=False)
     point, slash, number = name.partition("/")
     if slash:
-        points = store.points()
+        points = store.points.all()
         if not (point.isdecimal() and number.isdecimal()) or int(point) not in points:
             raise BenchError(f"run {name!r}: allowed is POINT/NUMBER, as in 1/0; points 1..{max(points, default=0)}")
         here = [row for row in rows if row.point == points[int(point)]]
         found = [row for row in here if row.number == int(number)]
-        found = found if len(found) < 2 else [row for row in store.rows() if row in found]
+        found = found if len(found) < 2 else [row for row in store.runs.all() if row in found]
         if not found:
             have = f"it has numbers up to {max(row.number for row in here)}" if here else "it has none"
             raise BenchError(f"run {name!r}: there is no such run of that point; {have}")
@@ -73,8 +73,8 @@ def find_run(store: Store, name: str) -> RunRow:
 def make_again(store: Store, name: str, out: Path | None, say: Callable[[str], None]) -> Again:
     """Make the run; says what stands in the way of its being the same. Raises BenchError."""
     before = find_run(store, name)
-    recipe = store.recipe(before.identity)
-    number = next(number for number, point in store.points().items() if point == before.point)
+    recipe = store.runs.recipe(before.identity)
+    number = next(number for number, point in store.points.all().items() if point == before.point)
     folder = out or Path("results") / f"{store.meta('name')}-{number}-{before.number}"
     check_folder(folder)
     version = code_version()

@@ -50,7 +50,7 @@ def remembered(store: Store) -> Campaign:
 
 def contents(store: Store) -> tuple[list[RunRow], Meta]:
     """The runs that count, and all else that a report says."""
-    campaign, rows, made = remembered(store), store.rows(), store.invocations()
+    campaign, rows, made = remembered(store), store.runs.all(), store.invocations.all()
     last = made[-1] if made else None
     notes = [f"{count} runs of version {version} are in the store and not counted" for version, count in _others(store)]
     meta = Meta(
@@ -78,4 +78,4 @@ def contents(store: Store) -> tuple[list[RunRow], Meta]:
 
 
 def _others(store: Store) -> list[tuple[str, int]]:
-    return list(store.others().items())
+    return list(store.runs.others().items())

@@ -129,7 +129,12 @@ class RandomSpec(SpecModel):
         if len(given) != 1:
             raise ValueError(f"{len(given)} distributions given; allowed is one of uniform, log_uniform, normal")
         draw, unit = self._draw()
-        return [with_unit(draw(stream.random()), unit) for _ in range(self.points)]
+        texts: dict[str, None] = {}
+        for _ in range(10 * self.points):  # what is drawn twice, to six digits, is one value; one more is drawn then
+            texts.setdefault(with_unit(draw(stream.random()), unit))
+            if len(texts) == self.points:
+                return list(texts)
+        raise ValueError(f"there are not {self.points} different values of six digits; allowed are fewer points")
 
     def _draw(self) -> tuple[Callable[[float], float], str]:
         """From a uniform share 0..1 to a value, and the unit."""

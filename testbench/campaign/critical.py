@@ -108,7 +108,7 @@ class CriticalPlan(Plan):
         self.search = search
         self.others = tuple(others)
         self.position = position
-        self._next: dict[tuple[Batch, ...], list[int]] = {}  # next_batches, remembered: a pure function
+        self._start = _Step(search, ())
 
     def point(self, other: Point, index: int) -> Point:
         """The place on the grid of value number `index` of a search."""
@@ -130,15 +130,11 @@ class CriticalPlan(Plan):
     def _walk(self, other: Point, known: Known) -> tuple[list[Wanted], tuple[Batch, ...], bool]:
         """(runs wanted, batches that are complete, whether the search is over)."""
         wanted: list[Wanted] = []
-        batches: tuple[Batch, ...] = ()
         outcomes: dict[Point, dict[int, Outcome]] = {}
-        while True:
-            if batches not in self._next:
-                self._next[batches] = next_batches(self.search, batches)
-            if not self._next[batches]:
-                return wanted, batches, True
+        step = self._start
+        while step.next:
             complete: list[Batch] = []
-            for index in self._next[batches]:
+            for index in step.next:
                 point = self.point(other, index)
                 if point not in outcomes:
                     outcomes[point] = {row.number: row.outcome for row in known.get(point, ())}
@@ -147,9 +143,27 @@ class CriticalPlan(Plan):
                 if all(number in outcomes[point] for number in numbers):
                     found = [outcomes[point][number] for number in numbers]
                     complete.append(Batch(index, tally(found, self.search.outcome)))
-            if len(complete) < len(self._next[batches]):
-                return wanted, batches, False
-            batches = (*batches, *complete)
+            if len(complete) < len(step.next):
+                return wanted, step.batches, False
+            step = step.after(complete)
+        return wanted, step.batches, True
+
+
+class _Step:
+    """Where a search stands after some batches, and, remembered, where it went from there: a pure function of them."""
+
+    def __init__(self, search: CriticalSearch, batches: tuple[Batch, ...]) -> None:
+        self.search = search
+        self.batches = batches
+        self.next = next_batches(search, batches)
+        self._after: dict[tuple[Batch, ...], _Step] = {}
+
+    def after(self, complete: Sequence[Batch]) -> "_Step":
+        """Where it stands when these batches are known as well."""
+        found = tuple(complete)
+        if found not in self._after:
+            self._after[found] = _Step(self.search, (*self.batches, *found))
+        return self._after[found]
 
 
 def _result(search: CriticalSearch, point: Point, batches: tuple[Batch, ...], over: bool) -> CriticalResult:

@@ -25,7 +25,7 @@ from testbench.campaign.statistics import NotEstimableError, Tally
 
 __all__ = ["Batch", "Side", "Tried", "crossing", "next_batches", "scan", "tried_values"]
 
-TURNS: Final = 5
+TURNS: Final = 3
 """One value gets at most this part of all runs before others get their turn."""
 
 

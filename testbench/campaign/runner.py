@@ -79,7 +79,7 @@ class Way:
 
 @dataclass(slots=True)
 class _State:
-    """What is known so far."""
+    """What is known so far; rows without metrics and activations, of which a large campaign has gigabytes."""
 
     known: dict[Point, list[RunRow]] = field(default_factory=dict)
     there: set[tuple[Point, int]] = field(default_factory=set)
@@ -113,15 +113,16 @@ class Runner:
 
     def prepare(self) -> None:
         """Take from the store what is there and still wanted, and say in it which runs count."""
-        self._store.add_points(self._campaign.points)
-        self._stored.update({row.identity: row for row in self._store.rows(self._way.version, wanted=False)})
+        self._store.points.add(self._campaign.points)
+        stored = self._store.runs.all(code_version=self._way.version, wanted=False, brief=True)
+        self._stored.update({row.identity: row for row in stored})
         self._ask()
         count = {
             self._campaign.identity_of(Wanted(row.point, row.number), self._way.version): (row.point, row.number)
             for rows in self._state.known.values()
             for row in rows
         }
-        self._store.want(count)
+        self._store.runs.want(count)
 
     def run(self, executor: Executor, watch: Watch, stop: Stop) -> Finished:
         """Make what is missing. Raises StoreError and ExecutorError; what was finished before is in the store."""
@@ -129,7 +130,7 @@ class Runner:
         machine, now = platform.node(), _now()
         way = self._way
         noted = Invocation(now, "", 0.0, way.jobs, 0, machine, way.version, way.command, "running")
-        number, how = self._store.begin(noted), "stopped by an error"
+        number, how = self._store.invocations.begin(noted), "stopped by an error"
         next_note = begun + NOTED_S
         try:
             while (self._queue or self._state.in_flight) and not stop():
@@ -137,7 +138,7 @@ class Runner:
                 self._take(executor.collect(LOOK_S))
                 watch(self._progress(begun))
                 if time.monotonic() >= next_note:
-                    self._store.end(number, "", time.monotonic() - begun, self._made, "running")
+                    self._store.invocations.note(number, "", time.monotonic() - begun, self._made, "running")
                     next_note = time.monotonic() + NOTED_S
             self._wind_up(executor, stop)
             finished = not (self._queue or self._state.in_flight)
@@ -145,7 +146,7 @@ class Runner:
         finally:
             executor.stop()
             if how != "stopped by an error":
-                self._store.end(number, _now(), time.monotonic() - begun, self._made, how)
+                self._store.invocations.note(number, _now(), time.monotonic() - begun, self._made, how)
         return Finished(self._progress(begun), reused, not finished)
 
     def _wind_up(self, executor: Executor, stop: Stop) -> None:
@@ -179,9 +180,10 @@ class Runner:
             if wanted is None:
                 raise BenchError(f"run {row.identity[:12]} came back without having been asked for")
             row = replace(row, point=wanted.point, number=wanted.number)
-            self._store.append(row, self._recipe(wanted))
-            self._stored[row.identity] = row
-            self._state.add(row)
+            self._store.runs.append(row, self._recipe(wanted))
+            brief = replace(row, metrics={}, injections=())
+            self._stored[row.identity] = brief
+            self._state.add(brief)
             self._made += 1
         if rows and len(self._queue) <= len(rows):
             self._ask()

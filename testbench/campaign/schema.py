@@ -28,13 +28,14 @@ from fi_gateway.marked_yaml import (
 )
 from fi_gateway.quantity import describe_value
 from testbench.campaign.axes import Axis, grid, read_axis, read_settings, size
+from testbench.campaign.combinations import CombinationPlan
 from testbench.campaign.filters import Filter, parse_filter
 from testbench.campaign.identity import identity, with_seed
 from testbench.campaign.records import Point, RunSpec, Wanted
 from testbench.campaign.rule_specs import FigureSpec, StopSpec, read_figures, read_rule
 from testbench.campaign.rules import Figure, FixedRuns, Rule, StopEarly
 from testbench.campaign.search import CombinationSearch, CriticalSearch
-from testbench.campaign.settings import COMBINATION_AXIS, Settings, checked, with_injectors
+from testbench.campaign.settings import Settings, checked
 from testbench.scenario import MAX_SEED, Name, Seed
 
 MOST_POINTS: Final = 20_000
@@ -201,8 +202,7 @@ def campaign_in(
     _raise(document, messages)
     assert whole is not None
     assert rule is not None
-    combined = rule.injectors if isinstance(rule, CombinationSearch) else ()
-    settings = Settings(base, tuple(axes), combined, _labels(axes, document))
+    settings = Settings(base, tuple(axes), _labels(axes, document))
     texts: dict[Point, str] = {}
     if stored is None:
         messages, texts = checked(settings, _tried_first(points, rule, axes))
@@ -241,9 +241,9 @@ def _raise(document: Document, messages: Sequence[str]) -> None:
 def _read_axes(data: Data, document: Document, seed: int) -> list[Axis]:
     axes = []
     for name, given in data.items() if isinstance(data, dict) else ():
-        if not name.isidentifier() or name in ("and", "or", "not", "in", COMBINATION_AXIS):
-            text = f"{name!r} is no name for an axis; allowed are letters, digits and _, not and, or, not, in"
-            document.report(("axes", name), f"{text}, {COMBINATION_AXIS}", at_key=True)
+        if not name.isidentifier() or name in ("and", "or", "not", "in"):
+            text = f"{name!r} is no name for an axis; allowed are letters, digits and _, but not and, or, not, in"
+            document.report(("axes", name), text, at_key=True)
             continue
         axis = read_axis(name, given, ("axes", name), document, seed)
         if axis is not None:
@@ -416,8 +416,8 @@ def _tried_first(points: Sequence[Point], rule: Rule, axes: Sequence[Axis]) -> l
             found.append(Point(tuple((axis.name, texts[axis.name]) for axis in axes)))
         return found
     if isinstance(rule, CombinationSearch):
-        sets = [(name,) for name in rule.injectors]
-        return [with_injectors(point, some) for point, some in itertools.product(points, sets)]
+        plan, sets = CombinationPlan(rule, points), [(), *((name,) for name in rule.injectors)]
+        return [plan.point(point, some) for point, some in itertools.product(points, sets)]
     return list(points)
 
 

@@ -3,7 +3,6 @@
 import copy
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Final
 
 from fi_gateway.marked_yaml import Document, FileErrors, Mark, set_value
 from testbench.campaign.axes import Axis
@@ -11,29 +10,16 @@ from testbench.campaign.records import Point
 from testbench.errors import BenchError
 from testbench.scenario import Scenario, scenario_in
 
-COMBINATION_AXIS: Final = "injectors"
-"""Name of the axis of a search for combinations; its values name the injectors that are enabled."""
-
-JOINED: Final = " + "
-NONE: Final = "none"
-
-
-def with_injectors(point: Point, injectors: Iterable[str]) -> Point:
-    """The point at which of the injectors that are combined only these are enabled: injectors = "a + b"."""
-    return Point((*point.parameters, (COMBINATION_AXIS, JOINED.join(injectors) or NONE)))
-
 
 @dataclass(frozen=True, slots=True)
 class Settings:
     """Makes scenarios of points. base: the scenario's document, changes for every run included, never changed here.
 
-    combined: injectors that a search for combinations switches on and off, all others stay as they are.
     labels: (axis, value) -> where the value stands in the campaign file, for messages.
     """
 
     base: Document
     axes: Sequence[Axis]
-    combined: tuple[str, ...] = ()
     labels: dict[tuple[str, str], str] = field(default_factory=dict)
 
     def scenario(self, point: Point) -> Scenario:
@@ -48,12 +34,11 @@ class Settings:
         return scenario_in(document)
 
     def _settings(self, name: str, text: str) -> Sequence[tuple[str, str]]:
-        if name == COMBINATION_AXIS:
-            enabled = text.split(JOINED)
-            return [(f"injectors.{one}.enabled", "true" if one in enabled else "false") for one in self.combined]
         for axis in self.axes:
             if axis.name == name:
                 return axis.settings(text)
+        if "." in name:  # a search for combinations names the switches of injectors themselves
+            return ((name, text),)
         raise BenchError(f"point with axis {name!r}: there are {', '.join(axis.name for axis in self.axes) or 'none'}")
 
     @property

@@ -125,7 +125,7 @@ def clopper_pearson(successes: int, trials: int, confidence: float = 0.95) -> In
 
 
 def runs_for_width(width: float, share: float | None = None, confidence: float = 0.95, method: str = "wilson") -> int:
-    """The smallest number of runs whose interval is at most `width` wide (0 < width < 1).
+    """The smallest number of runs from which on the interval is at most `width` wide (0 < width < 1).
 
     share None: whatever comes out, that is, at the widest interval a count can give, which is that of n // 2 of n.
     Else the interval at an observed share of exactly `share`: n x share is not rounded to a count, both formulas hold
@@ -141,19 +141,18 @@ def runs_for_width(width: float, share: float | None = None, confidence: float =
         raise ValueError(f"method {method!r} given; allowed: {', '.join(_ENDS)}")
     ends = _ENDS[method]
 
-    def wide_enough(trials: int) -> bool:
+    def too_wide(trials: int) -> bool:
         low, high = ends(trials // 2 if share is None else share * trials, trials, level)
         return high - low > width
 
-    most = 1
-    while wide_enough(most):
-        most *= 2
+    least, most = 0, 2  # not 1: one run has a narrower interval than one of two
+    while too_wide(most):
+        least, most = most, 2 * most
         if most > MAX_RUNS:
             raise ValueError(f"a width of {width} takes more than {MAX_RUNS:.0e} runs")
-    least = most // 2  # too few, or 0
     while most - least > 1:
         middle = (least + most) // 2
-        least, most = (middle, most) if wide_enough(middle) else (least, middle)
+        least, most = (middle, most) if too_wide(middle) else (least, middle)
     return most
 
 
