@@ -26,7 +26,8 @@ Array = NDArray[np.float64]
 
 STEPS: Final = 100
 """Newton takes some ten; the rest is for halved steps."""
-SMALL: Final = 1e-9
+SMALL: Final = 1e-8
+"""Of a log-likelihood: what is nothing."""
 SIMULATED: Final = 499
 
 
@@ -103,7 +104,7 @@ def logistic_fit(levels: Sequence[Level]) -> LogisticFit:
     if successes in (0, trials):
         raise NotEstimableError(f"{successes} of {trials} runs showed the outcome: all alike, they show no curve")
     data = _Data.of(used)
-    best = _curve(data)
+    best = _curve(data, np.array([_log_odds((successes + 0.5) / (trials + 1)), 0.0]))
     b = float(best.free[1]) / data.scale
     return LogisticFit(used, float(best.free[0]) - b * data.shift, b)
 
@@ -111,7 +112,8 @@ def logistic_fit(levels: Sequence[Level]) -> LogisticFit:
 def curve_misfit(fit: LogisticFit, generator: np.random.Generator, simulated: int = SIMULATED) -> float:
     """How likely shares as far from a logistic curve as these are by chance, if the fitted one is true (p-value)."""
     data = _Data.of(fit.levels)
-    return _misfit(data, lambda one: _share(one.columns @ _curve(one).free), generator, simulated)
+    start = np.array([fit.a + fit.b * data.shift, fit.b * data.scale])
+    return _misfit(data, lambda one: _share(one.columns @ _curve(one, start).free), generator, simulated)
 
 
 def fall_misfit(levels: Sequence[Level], generator: np.random.Generator, simulated: int = SIMULATED) -> float:
@@ -198,9 +200,8 @@ def _penalised(data: _Data, odds: Array) -> tuple[float, Array, Array]:
     return float(value) + math.log(determinant) / 2, share, leverage
 
 
-def _curve(data: _Data) -> _Best:
-    share = (data.successes.sum() + 0.5) / (data.trials.sum() + 1)
-    return _maximum(data, np.zeros(data.u.size), data.columns, np.array([_log_odds(share), 0.0]))
+def _curve(data: _Data, start: Array) -> _Best:
+    return _maximum(data, np.zeros(data.u.size), data.columns, start)
 
 
 def _rising(data: _Data) -> Array:

@@ -96,7 +96,7 @@ def test_wilson_covers_less_than_claimed_for_some_shares() -> None:
 
 @pytest.mark.parametrize("share", [0.02, 0.3, 0.5, 0.9])
 def test_drawn_shares_are_covered_as_often_as_computed(share: float) -> None:
-    """4000 campaigns of 60 runs, each with its seed: the covered part is the exact coverage within 4 standard errors."""
+    """4000 campaigns of 60 runs, each with its seed: covered as computed, within 4 standard errors."""
     drawn = [int(np.random.default_rng(seed).binomial(60, share)) for seed in range(4000)]
     for method in (wilson, clopper_pearson):
         intervals = {count: method(count, 60) for count in set(drawn)}
@@ -179,7 +179,7 @@ def test_no_run_has_no_interval(method: Method) -> None:
 @pytest.mark.parametrize("method", [wilson, clopper_pearson])
 def test_impossible_counts_are_refused(method: Callable[[float, float], Interval], counts: tuple[float, float]) -> None:
     """Counts are whole numbers, successes at most trials."""
-    with pytest.raises(ValueError, match="no share|whole number"):
+    with pytest.raises(ValueError, match=r"no share|whole number"):
         method(*counts)
 
 
