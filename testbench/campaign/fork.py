@@ -7,7 +7,7 @@ gateway that has its injectors and has seen what the golden run's gateway saw un
 
 The first activation is found with the engine itself: a gateway with the injectors is shown the frames of the golden run
 at their times and woken when it asks for it; what it sends goes nowhere. Only frames that it looks at are shown
-(`Relay.passes`). Fresh injectors are then brought to the instant of the copy in the same way, so that their random
+(`Relay.filters`). Fresh injectors are then brought to the instant of the copy in the same way, so that their random
 streams, held values and counters stand exactly where those of a straight run would.
 Left out: wire faults. They change the bus itself, from power-up on; such runs are made straight.
 """
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from canopen_exo.bus.frame import Frame
 from canopen_exo.bus.medium import Transmission
-from canopen_exo.bus.node import MS, NEVER, Out
+from canopen_exo.bus.node import MS, NEVER, PASS_ON, Out
 from canopen_exo.bus.trace import TraceHash
 from fi_gateway.gateway import Gateway
 from fi_gateway.injector import Injector
@@ -94,9 +94,9 @@ class Trunk:
         trunk = snapshot.rig
         gateway = Gateway(injectors, trunk.params.plan.cycle_ns)
         self._show(gateway, snapshot.now, until_active=False)
-        gateway.frames = list(snapshot.frames)
+        gateway.frames[:] = snapshot.frames
         rig = copy.deepcopy(trunk, {**_shared(trunk), id(trunk.gateway): gateway})
-        rig.loop.recall(self._rows[: snapshot.rows])
+        rig.loop.resume(self._rows[: snapshot.rows])
         rig.rack.truth.extend(self._truth[: snapshot.truth])
         rig.controller.samples.extend(self._samples[: snapshot.samples])
         return rig
@@ -128,7 +128,7 @@ class Trunk:
         first = min(int(at[0]) for at in self._seen.values())
         if self._ends[first] <= end_ns:
             yield first
-        wanted = [at for (port, can_id), at in self._seen.items() if not gateway.passes[port][can_id]]
+        wanted = [at for (port, can_id), at in self._seen.items() if gateway.filters[port][can_id] != PASS_ON]
         indices = np.sort(np.concatenate(wanted))
         yield from indices[(indices > first) & (self._ends[indices] <= end_ns)].tolist()
 
@@ -157,6 +157,7 @@ def _snapshot(rig: Rig, digest: TraceHash, hashed: int) -> Snapshot:
     truth, samples = rig.rack.truth, rig.controller.samples
     left: dict[int, object] = {id(truth): [], id(samples): [], id(rig.gateway): rig.gateway}
     twin = copy.deepcopy(rig, {**_shared(rig), **left})
+    twin.loop.forget()
     to_drives, to_controller = rig.gateway.frames
     return Snapshot(
         rig.loop.now, twin, (to_drives, to_controller), len(rows), len(truth), len(samples), digest.copy()

@@ -84,3 +84,58 @@ def test_traces_are_kept_as_a_result_folder_when_asked_for(workshop: Workshop, t
     summary = json.loads((tmp_path / "one" / "summary.json").read_text(encoding="utf-8"))
     assert summary["trace_hash"]["faulted"] == failing.trace_hash
     assert (tmp_path / "one" / "joints.png").is_file()
+
+
+SILENCE = (
+    "injectors={{mute: {{target: {{bus: to_drives, node: right_knee, pdo: RPDO1}}, fault: {{type: drop}}, "
+    "event: {{type: at, time: 0.9 s}}, effect: {{type: constant_time, duration: {duration}}}}}}}"
+)
+
+
+@pytest.mark.parametrize(
+    ("motion", "duration", "outcome"),
+    [
+        ("1 s", "0.1 ms", Outcome.NOT_MANIFESTED),
+        ("1 s", "10 ms", Outcome.MASKED),
+        ("1 s", "80 ms", Outcome.DETECTED_SAFE),
+        ("2 s", "80 ms", Outcome.FAILURE_DETECTED),
+    ],
+)
+def test_a_drive_without_commands_is_noticed_after_its_deadline(
+    workshop: Workshop, motion: str, duration: str, outcome: Outcome
+) -> None:
+    """RPDO deadline: 10 cycles, 20 ms; then an EMCY, and the controller ends the motion. A leg without torque swings
+    out of its range where there are no pins, so what is safe for 0.1 s is a failure, noticed, after 1 s."""
+    row = make_run(spec("golden", SILENCE.format(duration=duration), f"motion.duration={motion}"), workshop)
+    assert row.outcome is outcome
+    assert row.first_start_s == pytest.approx(0.9, abs=1e-9)
+    assert row.first_phase == pytest.approx(0.6, abs=1e-6)
+    if duration == "80 ms":
+        assert row.detection_latency_s is not None
+        assert 0.018 <= row.detection_latency_s <= 0.023, "the last command came up to one cycle before"
+    else:
+        assert row.detected_s is None
+    if outcome is Outcome.FAILURE_DETECTED:
+        assert row.failure_s is not None
+        assert row.detected_s is not None
+        assert row.detected_s < row.failure_s
+        assert row.beyond_deg > 0
+
+
+def test_a_flipped_bit_that_only_exceeds_a_torque_is_an_error(workshop: Workshop) -> None:
+    """No limit of travel was passed, and nobody noticed."""
+    high = ["injectors.flip_position.fault={type: bit_flip, positions: [17]}", "injectors.flip_position.event.time=1 s"]
+    row = make_run(spec("bit_flip", SHORT, *high), workshop)
+    assert row.outcome is Outcome.ERROR
+    assert (row.failure_s, row.detected_s, row.beyond_deg) == (None, None, 0.0)
+    assert row.errors > 0
+
+
+def test_a_golden_run_that_fails_makes_every_run_invalid(workshop: Workshop) -> None:
+    """Nothing can be measured by it, so no faulted run is made."""
+    fast = ["motion.stride=0.5 s", "motion.duration=0.6 s"]
+    row = make_run(spec("knee_freeze_at", *fast, "injectors.freeze_position.event.time=0.1 s"), workshop)
+    assert row.outcome is Outcome.INVALID
+    assert "golden run" in row.reason
+    assert row.metrics == {}
+    assert row.trace_hash == ""
