@@ -4,11 +4,12 @@ from collections.abc import Sequence
 from typing import Final
 
 from testbench.campaign.markup import Content, Html, table, tag
-from testbench.campaign.measured import FAILURE, count, is_share, number_at, quantity, stating, value_of
+from testbench.campaign.measured import count, is_share, number_at, quantity, stating, value_of
 from testbench.campaign.meta import Meta
 from testbench.campaign.phases import by_phase
 from testbench.campaign.ranking import Effect, Ranking, rank_parameters
 from testbench.campaign.records import RunRow
+from testbench.campaign.rules import FAILURE
 from testbench.campaign.sections import bar
 from testbench.campaign.statistics import NotEstimableError
 from testbench.campaign.tables import share_text

@@ -10,9 +10,10 @@ from collections.abc import Sequence
 from typing import Final
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
-from testbench.campaign.measured import EXCEEDED, FAILURE, by_point, count, stating, words_of
+from testbench.campaign.measured import EXCEEDED, by_point, count, points_of, stating, words_of
 from testbench.campaign.meta import Meta
 from testbench.campaign.records import NO_STATEMENT, Outcome, RunRow
+from testbench.campaign.rules import FAILURE
 from testbench.campaign.statistics import wilson
 
 _NOT_XML: Final = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
@@ -24,7 +25,7 @@ def junit_text(rows: Sequence[RunRow], meta: Meta) -> str:
     """The whole document."""
     top = Element("testsuites")
     totals = {"tests": 0, "failures": 0, "errors": 0}
-    for point, runs in by_point(rows, meta.points).items():
+    for point, runs in by_point(rows, points_of(rows, meta)).items():
         suite = _suite(meta, words_of(point), runs)
         top.append(suite)
         for key in totals:

@@ -1,17 +1,17 @@
 """What of a run a report can show over an axis, and which runs count for it."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final
 
 from testbench.campaign.axes import Axis
-from testbench.campaign.records import FAILURES, NO_STATEMENT, Outcome, Point, RunRow
+from testbench.campaign.meta import Meta
+from testbench.campaign.records import FAILURES, NO_STATEMENT, Point, RunRow
 from testbench.campaign.rule_specs import RUN_NUMBERS
 from testbench.campaign.rules import OUTCOMES
+from testbench.campaign.search import CombinationSearch, CriticalSearch
 from testbench.campaign.statistics import outcomes_named
 
-FAILURE: Final = Outcome.FAILURE.value
-"""Where a share is named: any of the failures."""
 EXCEEDED: Final = "exceeded"
 """Any limit exceeded: an error or a failure."""
 BEYOND_3DEG: Final = "beyond_3deg"
@@ -81,12 +81,33 @@ def count(rows: Iterable[RunRow], what: str) -> int:
     return sum(row.outcome in named for row in rows)
 
 
-def by_point(rows: Iterable[RunRow], points: Sequence[Point]) -> dict[Point, list[RunRow]]:
+def by_point(rows: Iterable[RunRow], points: Iterable[Point] = ()) -> dict[Point, list[RunRow]]:
     """The runs of each point, by number; in the order given, further points behind it as they come."""
     found: dict[Point, list[RunRow]] = {point: [] for point in points}
     for row in rows:
         found.setdefault(row.point, []).append(row)
     return {point: sorted(runs, key=lambda row: row.number) for point, runs in found.items()}
+
+
+def points_of(rows: Iterable[RunRow], meta: Meta) -> list[Point]:
+    """The points of a grid, whether they have runs or not; of a search, those where it has looked, in their order."""
+    if not is_search(meta):
+        return list(meta.points)
+    return sorted({row.point for row in rows}, key=lambda point: [_place(point, axis) for axis in meta.axes])
+
+
+def is_search(meta: Meta) -> bool:
+    """Whether the campaign chooses where to look by what it has found."""
+    return isinstance(meta.rule, CriticalSearch | CombinationSearch)
+
+
+def _place(point: Point, axis: Axis) -> tuple[float, str]:
+    """For sorting: by number where there is one, else as listed in the file."""
+    text = dict(point.parameters).get(axis.name, "")
+    value = number_at(point, axis)
+    if value is None:
+        value = float(axis.texts.index(text)) if text in axis.texts else float(len(axis.texts))
+    return value, text
 
 
 def number_at(point: Point, axis: Axis) -> float | None:

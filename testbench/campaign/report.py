@@ -12,6 +12,7 @@ from typing import Final
 from testbench.campaign.dependence import phase_section, ranking_section
 from testbench.campaign.junit import junit_text
 from testbench.campaign.markup import Html, tag
+from testbench.campaign.measured import is_search
 from testbench.campaign.meta import Meta
 from testbench.campaign.plots import figure_section, values_section
 from testbench.campaign.records import NO_STATEMENT, RunRow
@@ -41,8 +42,8 @@ def html_text(rows: Sequence[RunRow], meta: Meta) -> str:
         ("search", "What was searched", search_section(rows, meta, drawn + 1)),
         ("outcomes", "Outcomes by point", outcome_section(rows, meta)),
         ("values", "Numbers of the figures", values_section(rows, meta)),
-        ("phase", "By gait phase", phase_section(rows)),
-        ("ranking", "What matters", ranking_section(rows, meta)),
+        ("phase", "By gait phase", None if is_search(meta) else phase_section(rows)),
+        ("ranking", "What matters", None if is_search(meta) else ranking_section(rows, meta)),
         ("runs", "Runs to look at", notable_runs(rows, meta)),
         ("how", "How it was run", _how(rows, meta)),
         ("file", "Campaign file", _file(meta)),

@@ -12,6 +12,8 @@ from testbench.campaign.records import Point, RunRow
 from testbench.campaign.search import CriticalSearch
 from testbench.campaign.tables import Table
 
+_ZOOM: Final = 115
+"""CSS pixels per inch at most; 96 are the size it was drawn for."""
 _IN_CELLS: Final = {Answer.BEYOND: ">", Answer.BELOW: "<"}
 
 
@@ -20,7 +22,7 @@ def critical_results(rows: Sequence[RunRow], meta: Meta) -> tuple[CriticalResult
     if not isinstance(meta.rule, CriticalSearch):
         return ()
     position = [axis.name for axis in meta.axes].index(meta.rule.axis)
-    return CriticalPlan(meta.rule, meta.points, position).results(by_point(rows, ()))
+    return CriticalPlan(meta.rule, meta.points, position).results(by_point(rows))
 
 
 def search_section(rows: Sequence[RunRow], meta: Meta, figure: int) -> Html | None:
@@ -81,7 +83,9 @@ def _map(results: Sequence[CriticalResult], others: Sequence[str], figure: int) 
     title = f"Critical {search.axis} over {others[1]} and {others[0]}"
     svg = inline_svg(drawn, figure, title, "The numbers are in the table below.")
     note = "> and <: beyond the ends of the axis; ?: no one value, or not enough evidence, see the table."
-    return tag("figure", svg, tag("figcaption", tag("b", f"Figure {figure}. {title}. "), note), class_="wide")
+    caption = tag("figcaption", tag("b", f"Figure {figure}. {title}. "), note)
+    width = f"max-width:{_ZOOM * drawn.get_figwidth():.0f}px"
+    return tag("figure", tag("div", tag("div", svg, style=width), class_="wide"), caption)
 
 
 def _value(one: CriticalResult) -> float | None:

@@ -5,10 +5,11 @@ from collections.abc import Mapping, Sequence
 from typing import Final
 
 from testbench.campaign.markup import Content, Html, table, tag
-from testbench.campaign.measured import EXCEEDED, FAILURE, by_point, count, ended_early, stating, words_of
+from testbench.campaign.measured import EXCEEDED, by_point, count, ended_early, is_search, points_of, stating, words_of
 from testbench.campaign.meta import Meta
 from testbench.campaign.notable import Notable, latest_noticed, odd, replay_command, slowest, worst
 from testbench.campaign.records import NO_STATEMENT, Outcome, RunRow
+from testbench.campaign.rules import FAILURE
 from testbench.campaign.tables import outcome_table, share_text, words
 
 _MOST_ROWS: Final = 240
@@ -40,27 +41,35 @@ def headline(rows: Sequence[RunRow], meta: Meta) -> Html:
         makes, is_ = ("makes", "is") if mute.total() == 1 else ("make", "are")
         lines.append(f"{mute.total()} of them {makes} no statement ({parts}) and {is_} in no share below. ")
     failing = count(judged, FAILURE)
+    over = (
+        "; a search looks where it expects to learn most, so that this is no share of anything"
+        if is_search(meta)
+        else f": {share_text(failing, len(judged))} over all points together"
+    )
     summary = tag(
         "p",
         tag("strong", f"{failing} of {len(judged)} runs failed"),
-        f": {share_text(failing, len(judged))} over all points together. In {count(judged, EXCEEDED)} runs a limit of "
-        "torque, speed or angle was exceeded.",
+        f"{over}. In {count(judged, EXCEEDED)} runs a limit of torque, speed or angle was exceeded.",
     )
     counts = Counter(row.outcome for row in rows)
-    body = [
-        (_swatch(outcome), str(counts[outcome]), share_text(counts[outcome], len(judged)) if said else "no statement")
-        for outcome in Outcome
-        if counts[outcome]
-        for said in (outcome not in NO_STATEMENT,)
-    ]
-    return tag("section", tag("p", lines), summary, table("Outcomes of all runs", ("outcome", "runs", "share"), body))
+    heads = ["outcome", "runs"]
+    body: list[list[Content]] = [[_swatch(outcome), str(counts[outcome])] for outcome in Outcome if counts[outcome]]
+    if not is_search(meta):
+        heads.append("share")
+        for cells, outcome in zip(body, (one for one in Outcome if counts[one]), strict=True):
+            cells.append(_share_of_all(outcome, counts[outcome], len(judged)))
+    return tag("section", tag("p", lines), summary, table("Outcomes of all runs", heads, body))
+
+
+def _share_of_all(outcome: Outcome, found: int, judged: int) -> str:
+    return "no statement" if outcome in NO_STATEMENT else share_text(found, judged)
 
 
 def outcome_section(rows: Sequence[RunRow], meta: Meta) -> Html:
     """Outcomes by point, each with a bar."""
     counted = outcome_table(rows, meta)
     at = len(meta.axes) + 1
-    runs = list(by_point(rows, meta.points).values())
+    runs = list(by_point(rows, points_of(rows, meta)).values())
     body: list[list[Content]] = [
         [*cells[:at], bar(stating(found)), *cells[at:]]
         for cells, found in list(zip(counted.body, runs, strict=True))[:_MOST_ROWS]
@@ -84,7 +93,7 @@ def notable_runs(rows: Sequence[RunRow], meta: Meta) -> Html:
     """The runs to look at, each with what replays it."""
     kinds: Mapping[str, list[Notable]] = {
         "Worst runs": worst(rows),
-        "Odd runs": odd(by_point(rows, meta.points)),
+        "Odd runs": odd(by_point(rows, points_of(rows, meta))),
         "Noticed last": latest_noticed(rows),
         "Slowest runs": slowest(rows),
     }

@@ -5,9 +5,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from testbench.campaign.measured import BEYOND_3DEG, EXCEEDED, FAILURE, by_point, count, stating
+from testbench.campaign.measured import BEYOND_3DEG, EXCEEDED, by_point, count, points_of, stating
 from testbench.campaign.meta import Meta
 from testbench.campaign.records import NO_STATEMENT, Outcome, RunRow
+from testbench.campaign.rules import FAILURE
 from testbench.campaign.statistics import wilson
 
 SHARES: Final = {
@@ -34,7 +35,7 @@ class Table:
 
 def outcome_table(rows: Sequence[RunRow], meta: Meta) -> Table:
     """A row a point: outcomes, shares of failures and exceeded limits, reactions, what makes no statement."""
-    runs = by_point(rows, meta.points)
+    runs = by_point(rows, points_of(rows, meta))
     seen = [outcome for outcome in Outcome if any(row.outcome is outcome for row in rows)]
     judged_seen = [outcome for outcome in seen if outcome not in NO_STATEMENT]
     mute = bool(set(seen) & NO_STATEMENT)
