@@ -98,14 +98,6 @@ class Passage:
                 if route is not None and route.kind == PLAIN and not route.injectors and not route.watchers:
                     table[cob_id] = None
 
-    def release_sync(self) -> bool:
-        """Time 0 is known, the gateway needs SYNC no longer; True when nobody else looks at it, so that it passes."""
-        route = self.from_controller[SYNC]
-        if route is None or route.injectors or route.watchers:
-            return False
-        self.from_controller[SYNC] = None
-        return True
-
     def plan(self) -> None:
         """Note when something is due next."""
         self.windows.plan()

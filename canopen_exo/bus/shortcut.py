@@ -1,19 +1,19 @@
 """The short way through the real-time loop: what a Relay only passes on goes as the record that came.
 
-Two channels that carry records, and a node that says which COB-IDs it has nothing to do with (`Relay.passes`): runs of
+Two channels that carry records, and a node that says which COB-IDs it has nothing to do with (`Relay`): runs of
 such frames go out of the buffers they were read into, many with one call, and nothing is made of them. A frame between
 them is made and given to the node. What the node sees, and when, is as if it had been given all of them, and so is what
-goes out on each bus; only what the node adds to one direction because of a frame from the other one may go behind
+goes out on each bus; only what the node adds to one direction because of a frame from the other one may go before
 frames that had come in the same turn.
 As soon as something is in the way, the loop serves what is left frame by frame: another kind of frame or a notice has
-come, a wake-up is due among the frames, the relay has more to do with all of them, or a channel takes no more.
+come, a wake-up is due among the frames, the relay filters otherwise than before, or a channel takes no more.
 """
 
 from collections.abc import Callable
 from typing import Final, final
 
 from canopen_exo.bus.channel import Arrival, RecordChannel
-from canopen_exo.bus.node import NEVER, Relay
+from canopen_exo.bus.node import NEVER, PASS_ON, Relay
 from canopen_exo.bus.realtime_out import Line, RealTimeOut
 
 _PLACES: Final = (0, 1)
@@ -75,9 +75,8 @@ class ShortCut:
         relay, source, line = self._relay, self._channels[place], self._lines[1 - place]
         stamp = source.stamps[0]
         if (
-            relay.passes[place][source.ids[0]]
+            relay.filters[place][source.ids[0]] == PASS_ON
             and relay.wake_at >= stamp
-            and not relay.is_disturbed
             and not line.waiting
             and self._channels[1 - place].send_run(source, 0, 1)
         ):
@@ -92,34 +91,36 @@ class ShortCut:
     def _serve_runs(self) -> None:
         """Base data frames alone, until all are served or something is in the way."""
         at, ends = self._at, self._ends
-        tables = list(self._relay.passes)
+        filters = [bytearray(one) for one in self._relay.filters]
         latest = -NEVER
         stops: list[tuple[int, int, int]] = []  # stamp, place and number of those that do not only pass
         for place, _, channel in self._ways:
             if ends[place]:
-                table, stamps = tables[place], channel.stamps
+                table, stamps = filters[place], channel.stamps
                 if stamps[-1] > latest:
                     latest = stamps[-1]
-                stops += [(stamps[number], place, number) for number, one in enumerate(channel.ids) if not table[one]]
+                stops += [
+                    (stamps[number], place, number) for number, one in enumerate(channel.ids) if table[one] != PASS_ON
+                ]
         if ends[0] and ends[1]:
             stops.sort()
         for stamp, place, number in stops:
-            if not self._is_free(latest, tables) or (at[place] < number and not self._pass_on(place, number)):
+            if not self._is_free(latest, filters) or (at[place] < number and not self._pass_on(place, number)):
                 return
             at[place] = number + 1
             self._deliver(self._lines[place], self._channels[place].arrival(number), stamp)
         for place in _PLACES:
-            if at[place] < ends[place] and not (self._is_free(latest, tables) and self._pass_on(place, ends[place])):
+            if at[place] < ends[place] and not (self._is_free(latest, filters) and self._pass_on(place, ends[place])):
                 return
         if latest > self._out.served_ns:
             self._out.served_ns = latest
 
-    def _is_free(self, latest: int, tables: list[bytearray]) -> bool:
+    def _is_free(self, latest: int, filters: list[bytearray]) -> bool:
         """Whether nothing is in the way of frames up to the stamp `latest`, and what passes is what passed before."""
         relay, lines = self._relay, self._lines
-        if relay.is_disturbed or relay.wake_at < latest or relay.passes != tables:
+        if relay.wake_at < latest or lines[0].waiting or lines[1].waiting:
             return False
-        return not (lines[0].waiting or lines[1].waiting)
+        return relay.filters == filters
 
     def _pass_on(self, place: int, limit: int) -> bool:
         """Send what came on a channel up to `limit` on the other one; False when that did not take all of it."""

@@ -205,32 +205,29 @@ class SocketCanChannel(RecordChannel):
 
     def read(self) -> bool:
         """As `receive`, kept."""
-        now = self._stamps.begin(self.epoch_ns)
         if self._found:
             self._found = []
         self.count = 0
         if self._socket is None and not self._is_closed:
-            self._reopen(now)
+            self._reopen(time.monotonic_ns() - self.epoch_ns)
+        receiver = self._receiver
+        count = 0
+        failure: OSError | None = None
         if self._socket is not None:
-            receiver = self._receiver
             try:
                 count = receiver.read()
-                if receiver.is_plain and not self._is_down and not self._notices:
-                    if count == 1:  # a frame alone, what a bus that is not crowded gives, waits for this
-                        can_id, length, seconds, nanos = receiver.first()
-                        if can_id <= 0x7FF and length <= 8:
-                            self.ids = [can_id]
-                            self.stamps = [self._stamps.at(seconds * SECOND + nanos)]
-                            self.count = 1
-                            return True
-                    elif self._take_base():
-                        self.count = count
-                        return True
-                self._take_all(now)
             except BlockingIOError:
                 pass
             except OSError as error:
-                self._fail(error, now)
+                failure = error
+        now = self._stamps.begin(self.epoch_ns)  # not before reading: no stamp is later than now
+        if count and receiver.is_plain and not self._is_down and not self._notices and self._take_base(count):
+            self.count = count
+            return True
+        if count:
+            self._take_all(now)
+        elif failure is not None:
+            self._fail(failure, now)
         if self._notices:
             self._hand_out(now)
         if self._socket is not None:
@@ -309,9 +306,16 @@ class SocketCanChannel(RecordChannel):
         self._sender.attach(can)
         self._fd = can.fileno()
 
-    def _take_base(self) -> bool:
+    def _take_base(self, count: int) -> bool:
         """Plain records that are base data frames, as nearly all are; False for any other."""
         receiver = self._receiver
+        if count == 1:  # a frame alone, what a bus that is not crowded gives, waits for this
+            can_id, length, seconds, nanos = receiver.first()
+            if can_id > 0x7FF or length > 8:
+                return False
+            self.ids = [can_id]
+            self.stamps = [self._stamps.at(seconds * SECOND + nanos)]
+            return True
         ids = receiver.ids()
         if max(ids) > 0x7FF or receiver.longest() > 8:
             return False

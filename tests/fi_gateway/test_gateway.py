@@ -783,17 +783,3 @@ def test_an_effect_counted_in_frames_can_arm_again() -> None:
     out = [pass_through(gateway, ZERO + now, joint(1, 2)) is None for now in times]
     assert out == [False, True, True, False, False, True, True, False]
     assert gateway.wake_at == NEVER
-
-
-def test_sync_only_passes_once_time_zero_is_known() -> None:
-    """It has told all it had to tell: a loop may then pass it on by itself; not where somebody still looks at it."""
-    for targets, passes in (((0x185,), 1), ((0x80,), 0)):
-        one = injector(Drop(), Never(), Infinite(), target=Target(True, True, targets))
-        gateway, sink = Gateway([one], CYCLE), Sink()
-        gateway.receive(0, CONTROLLER_PORT, Frame(0x80, b"\1"), sink)
-        assert gateway.passes[CONTROLLER_PORT][0x80] == 0
-        gateway.receive(1, CONTROLLER_PORT, status(2, 0), sink)
-        assert gateway.time_zero == 0
-        assert gateway.passes[CONTROLLER_PORT][0x80] == passes
-        gateway.receive(CYCLE, CONTROLLER_PORT, Frame(0x80, b"\2"), sink)
-        assert (len(sink.sent), gateway.frames) == (3, [3, 0])

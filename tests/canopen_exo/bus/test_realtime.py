@@ -248,9 +248,7 @@ def test_stamp_in_the_future_does_not_wake_the_node_early() -> None:
     st.integers(1, 900),
     st.integers(0, 3000),
 )
-def test_any_traffic_is_served_once_in_order(
-    plan: list[tuple[int, int, int]], period: int, oversleep: int
-) -> None:
+def test_any_traffic_is_served_once_in_order(plan: list[tuple[int, int, int]], period: int, oversleep: int) -> None:
     """Nothing lost, time never back for frames, wake-ups each at their time, each channel's order kept."""
     world = World(2)
     world.oversleep = oversleep
