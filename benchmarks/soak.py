@@ -2,7 +2,7 @@
 
 The gateway runs in a process of its own, as it does on SocketCAN (`forwarders` has how), with one rule that is active
 all the time and changes one COB-ID in one direction only. Every record that comes out is compared, byte for byte, with
-the one that is due. Then a tenth as many of base data frames alone, which go in runs. Then as many with buses on the way
+the one that is due. Then a tenth as many base data frames alone, which go in runs. Then as many with buses on the way
 out that are busy again and again, so that frames wait in the gateway: they leave in the order in which they came. Then
 the full bus: 9009 frames a second.
 
@@ -62,7 +62,7 @@ class Stream:
     """One direction: what is sent next, and what is due to come out."""
 
     def __init__(
-        self, source: socket.socket, sink: socket.socket, towards_controller: bool, frames: int, base_only: bool
+        self, source: socket.socket, sink: socket.socket, towards_controller: bool, frames: int, base_only: bool = False
     ) -> None:
         self.source = source
         self.sink = sink
