@@ -20,8 +20,9 @@ class Outcome(Enum):
     not_activated: no fault began; not_manifested: none changed a frame; masked: frames were changed, no limit was
     exceeded; error: a torque or speed beyond its limit; detected_safe: drive or master reacted (EMCY, quick stop,
     heartbeat) and ended the motion before any failure; failure_detected, failure_silent: a joint left its range of
-    travel, and somebody reacted to the fault, or nobody did; failure: it did, and nobody was there who could have said
-    whether it was noticed (foreign parts). No statement about the system: hang: the run did not end in its time;
+    travel, and by then somebody had reacted to the fault, or nobody had (a reaction after that prevents nothing;
+    `RunRow.detected_s` has it all the same); failure: it did, and nobody was there who could have said whether it was
+    noticed (foreign parts). No statement about the system: hang: the run did not end in its time;
     invalid: it proves nothing (lost or late frames, a golden run that fails); crashed: its process died.
     """
 
@@ -104,9 +105,10 @@ class RunRow:
     metrics: name -> number, such as "right_knee.rmse_position_rad" (every number of `joints` in the document of a
     single run), without those that could not be measured. first_start_s: first activation; first_phase: gait phase
     there, 0..1 of a stride. activated, injected, manifested: the counts of the document. detected_s: first reaction of
-    drive or master at or after first_start_s; detection_latency_s: from first_start_s to it. beyond_deg, beyond_s: most
-    that any joint went beyond its range of travel, and how long joints were beyond it, 0 for not at all; beyond_joint:
-    the worst one. ended_s: end of the motion that was judged, shorter than it was to be after an early stop.
+    drive or master at or after first_start_s; detection_latency_s: from first_start_s to it; failure_s: the first
+    failure, before detected_s where the reaction came too late. beyond_deg, beyond_s: most that any joint went beyond
+    its range of travel (no tolerance), and how long any joint was beyond it, 0 for not at all; beyond_joint: the worst
+    one. ended_s: end of the motion that was judged, shorter than it was to be after an early stop.
     errors, failures, failures_at_3deg: number of entries. golden_hash, trace_hash: SHA-256. attempts: how often it was
     tried; started: UTC, ISO 8601; wall_s, cpu_s: of the try that counts; forked_s: motion taken over from the golden
     run; machine, versions: where and with what.
@@ -126,6 +128,7 @@ class RunRow:
     manifested: int = 0
     detected_s: float | None = None
     detection_latency_s: float | None = None
+    failure_s: float | None = None
     beyond_deg: float = 0.0
     beyond_s: float = 0.0
     beyond_joint: str = ""
