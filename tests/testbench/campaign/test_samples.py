@@ -112,6 +112,8 @@ def test_the_bootstrap_covers_what_docs_say() -> None:
     ):
         found = covered([bootstrap_interval(list(row), generator, resamples=999) for row in draws], true)
         assert low < found < high
+    skewed = generator.lognormal(size=(CAMPAIGNS, 30))
+    assert 0.82 < covered([mean_interval(list(row)) for row in skewed], math.exp(0.5)) < 0.91
 
 
 @pytest.mark.parametrize("values", [[], [1.0]])
