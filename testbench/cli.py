@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from testbench.cli_campaign import add_campaign_verbs
 from testbench.cli_rig import CONTROL_ADDRESS, HUB_ADDRESS, add_rig_options, add_verbs, named_buses
 
 if TYPE_CHECKING:
@@ -81,11 +82,12 @@ def _parser() -> argparse.ArgumentParser:
     run.set_defaults(verb=_run)
 
     check = verbs.add_parser("check", help="validate a scenario and say what it will do", description=_check.__doc__)
-    check.add_argument("scenario", type=Path, metavar="FILE", help="a scenario, or faults for `exo-hil gateway`")
+    check.add_argument("scenario", type=Path, metavar="FILE", help="a scenario, a campaign, or faults for a gateway")
     check.add_argument("--seed", metavar="N", help="instead of the scenario's seed")
     check.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="overrides", help="as for run")
     check.set_defaults(verb=_check)
 
+    add_campaign_verbs(verbs, _print)
     add_verbs(verbs)
 
     export = verbs.add_parser("export", help="write files for other tools", description=_export.__doc__)
@@ -213,8 +215,10 @@ def _real_time_buses(options: argparse.Namespace) -> tuple[str, str] | None:
 
 
 def _check(options: argparse.Namespace) -> int:
-    """Validate a scenario, or a file of faults for the gateway, and say in words what it will do; nothing is run."""
+    """Validate a scenario, a campaign, or a file of faults for the gateway, and say in words what it will do."""
     from fi_gateway.marked_yaml import FileErrors
+    from testbench.campaign.schema import is_campaign_file
+    from testbench.cli_campaign import check_campaign
     from testbench.fault_file import FaultFile, describe_faults, load_any
     from testbench.scenario import describe
 
@@ -222,6 +226,8 @@ def _check(options: argparse.Namespace) -> int:
     if options.seed is not None:
         overrides.append(f"seed={options.seed}")
     try:
+        if is_campaign_file(options.scenario):
+            return check_campaign(options.scenario, options.overrides, options.seed, _print)
         found = load_any(options.scenario, overrides)
     except FileErrors as error:
         _say(_as_typed(error, options))
