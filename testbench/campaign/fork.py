@@ -36,6 +36,9 @@ from testbench.run import chunks, record_of
 SNAPSHOT_NS: Final = 200 * MS
 """Distance of the copies: whole multiples of the loop's chunks, so that a branch ends where a straight run does."""
 
+MOST_SNAPSHOTS: Final = 64
+"""About as many; 0.7 MB each (measured). In a longer run they lie further apart, in multiples of SNAPSHOT_NS."""
+
 Indices = NDArray[np.int64]
 
 
@@ -66,8 +69,9 @@ class Trunk:
         rig = build_rig(params, [])
         digest = TraceHash()
         self.snapshots: list[Snapshot] = []
+        distance_ns = snapshot_distance(params)
         for now in chunks(rig):
-            if with_snapshots and now % SNAPSHOT_NS == 0:
+            if with_snapshots and now % distance_ns == 0:
                 self.snapshots.append(_snapshot(rig, digest, self.snapshots[-1].rows if self.snapshots else 0))
         rig.gateway.finish(rig.loop.now)
         self.record: RunRecord = record_of(rig)
@@ -138,6 +142,11 @@ def _wake(gateway: Gateway, now: int, until: int, until_active: bool) -> None:
     while gateway.wake_at <= until and not (until_active and gateway.records):
         now = max(now, gateway.wake_at)
         gateway.wake(now, _NOWHERE)
+
+
+def snapshot_distance(params: RigParams) -> int:
+    """How far apart the copies of such a golden run lie [ns]."""
+    return max(1, -(-(params.stride_ns + params.duration_ns) // (MOST_SNAPSHOTS * SNAPSHOT_NS))) * SNAPSHOT_NS
 
 
 class _Nowhere(Out):

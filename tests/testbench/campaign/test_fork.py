@@ -5,12 +5,14 @@ import dataclasses
 import pytest
 
 from canopen_exo.bus.node import MS
+from canopen_exo.plan import BusPlan
 from testbench.campaign.early import LOOK_NS
 from testbench.campaign.execute import Workshop, make_run
-from testbench.campaign.fork import SNAPSHOT_NS
+from testbench.campaign.fork import SNAPSHOT_NS, snapshot_distance
 from testbench.campaign.records import Outcome, RunRow, RunSpec
+from testbench.rig import RigParams
 from testbench.run import CHUNK_NS, rig_params
-from testbench.scenario import parse_scenario
+from testbench.scenario import default_joints, parse_scenario
 from tests.testbench.campaign.specs import spec
 
 pytestmark = pytest.mark.run
@@ -193,6 +195,16 @@ def test_snapshots_and_looks_lie_where_the_loop_pauses() -> None:
     assert SNAPSHOT_NS % CHUNK_NS == 0
     assert CHUNK_NS % LOOK_NS == 0
     assert LOOK_NS % MS == 0
+
+
+@pytest.mark.parametrize(
+    ("duration_s", "distance_ms"), [(1, 200), (7, 200), (11, 200), (12, 400), (60, 1000), (3600, 56_400)]
+)
+def test_the_number_of_snapshots_is_bounded_however_long_the_motion(duration_s: int, distance_ms: int) -> None:
+    """They lie further apart then."""
+    plan = BusPlan(default_joints())
+    params = RigParams(plan, stops=False, stride_ns=1500 * MS, duration_ns=duration_s * 1000 * MS)
+    assert snapshot_distance(params) == distance_ms * MS
 
 
 @pytest.mark.parametrize("grace_s", [0.0, 0.05, 0.2])
