@@ -69,7 +69,7 @@ class Node:
     """Something on a bus: a controller, a device, a rack of devices, a gateway.
 
     wake_at: absolute time [ns] of the next call to `wake`, NEVER for none; read afresh before every wait.
-    filters: acceptance filters, as a CAN controller has them: by port and 11-bit id, IGNORE where `receive` does nothing
+    filters: acceptance filters, as in a CAN controller: by port and 11-bit id, IGNORE where `receive` does nothing
     with a base data frame, so that a loop need not call it, else TAKE; none at all for a node that takes everything.
     The node may change what stands in them at any time, but not take others.
     """

@@ -67,7 +67,7 @@ class Workshop:
         room for a new one.
         """
         found = self._golden.pop(params, None)
-        if found is None or (fork and not found.snapshots):
+        if found is None or (fork and not found.has_snapshots):
             found = Trunk(params, fork)
             self.made += 1
             while len(self._golden) >= GOLDEN_KEPT:
