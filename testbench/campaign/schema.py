@@ -5,6 +5,7 @@ included: what `load_campaign` returns can be run. The lists of a file are data,
 """
 
 import itertools
+import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -179,9 +180,9 @@ def campaign_in(
 
     stored: text of the scenario, and then the points are not looked at.
     """
-    if runs is not None and isinstance(document.data, dict) and "search" not in document.data:
-        document.data["runs"] = runs
+    if runs is not None and isinstance(document.data, dict):
         document.values["runs",] = document.keys["runs",] = Mark(1, 0, f"--runs {runs}")
+        document.data["runs"] = runs
     whole = validate(CampaignFile, document.data, (), document)
     data = document.data if isinstance(document.data, dict) else {}
     seed = whole.seed if whole is not None else 1
@@ -307,8 +308,8 @@ def _base(
         base = _part(document, ("scenario",))
     elif isinstance(given, str):
         try:
-            path = Path(document.source).parent / given
-            base = load(path) if stored is None else parse(stored, str(path))
+            path = _beside(document.source, given)
+            base = load(path) if stored is None else parse(stored, path)
         except FileErrors as error:
             first = error.messages[0]
             if first.endswith("no such file"):
@@ -336,6 +337,13 @@ def _base(
     return base, []
 
 
+def _beside(source: str, given: str) -> str:
+    """The path of a file named in another one; without `..` in it, unless links make that another file."""
+    path = os.path.join(os.path.dirname(source), given)
+    short = os.path.normpath(path)
+    return short if os.path.exists(path) and os.path.exists(short) and os.path.samefile(path, short) else path
+
+
 def _part(document: Document, at: Keys) -> Document:
     """A part of a document as one of its own; places in messages stay those of the file."""
     data, deep = document.data, len(at)
@@ -346,7 +354,8 @@ def _part(document: Document, at: Keys) -> Document:
         name: {keys[deep:]: mark for keys, mark in marks.items() if keys[:deep] == at}
         for name, marks in (("values", document.values), ("keys", document.keys))
     }
-    return Document(document.source, data, cut["values"], cut["keys"])
+    broken = {keys[deep:] for keys in document.broken if keys[:deep] == at}
+    return Document(document.source, data, cut["values"], cut["keys"], broken=broken)
 
 
 def _check_keys(axes: Sequence[Axis], base: Document, document: Document) -> None:
