@@ -10,7 +10,7 @@ from testbench.campaign.meta import Meta
 from testbench.campaign.notable import Notable, latest_noticed, odd, replay_command, slowest, worst
 from testbench.campaign.records import NO_STATEMENT, Outcome, RunRow
 from testbench.campaign.rules import FAILURE
-from testbench.campaign.tables import outcome_table, share_text, words
+from testbench.campaign.tables import RUNS, outcome_table, share_text, words
 
 _MOST_ROWS: Final = 240
 
@@ -68,7 +68,7 @@ def _share_of_all(outcome: Outcome, found: int, judged: int) -> str:
 def outcome_section(rows: Sequence[RunRow], meta: Meta) -> Html:
     """Outcomes by point, each with a bar."""
     counted = outcome_table(rows, meta)
-    at = len(meta.axes) + 1
+    at = counted.heads.index(RUNS) + 1
     runs = list(by_point(rows, points_of(rows, meta)).values())
     body: list[list[Content]] = [
         [*cells[:at], bar(stating(found)), *cells[at:]]

@@ -11,6 +11,7 @@ from testbench.campaign.records import NO_STATEMENT, Outcome, RunRow
 from testbench.campaign.rules import FAILURE
 from testbench.campaign.statistics import wilson
 
+RUNS: Final = "runs with a statement"
 SHARES: Final = {
     FAILURE: "failed",
     BEYOND_3DEG: "failed by more than 3 deg",
@@ -39,7 +40,7 @@ def outcome_table(rows: Sequence[RunRow], meta: Meta) -> Table:
     seen = [outcome for outcome in Outcome if any(row.outcome is outcome for row in rows)]
     judged_seen = [outcome for outcome in seen if outcome not in NO_STATEMENT]
     mute = bool(set(seen) & NO_STATEMENT)
-    axes = [axis.name for axis in meta.axes]
+    axes = list(dict.fromkeys(name for point in runs for name, _ in point.parameters))
     body = []
     for point, found in runs.items():
         judged, values = stating(found), dict(point.parameters)
@@ -49,7 +50,7 @@ def outcome_table(rows: Sequence[RunRow], meta: Meta) -> Table:
         cells += [share_text(count(judged, what), len(judged)) for what in SHARES]
         cells.append(_noticed(judged))
         body.append((*cells, *([_mute(found)] if mute else [])))
-    heads = (*axes, "runs", *map(words, judged_seen), *SHARES.values(), "noticed", *(["no statement"] if mute else []))
+    heads = (*axes, RUNS, *map(words, judged_seen), *SHARES.values(), "noticed", *(["no statement"] if mute else []))
     texts = {*range(len(axes)), *([len(heads) - 1] if mute else [])}
     return Table("Outcomes by point", heads, tuple(body), frozenset(texts))
 
