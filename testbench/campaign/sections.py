@@ -10,7 +10,7 @@ from testbench.campaign.meta import Meta
 from testbench.campaign.notable import Notable, latest_noticed, odd, replay_command, slowest, worst
 from testbench.campaign.records import NO_STATEMENT, Outcome, RunRow
 from testbench.campaign.rules import FAILURE
-from testbench.campaign.tables import RUNS, outcome_table, share_text, words
+from testbench.campaign.tables import outcome_table, words
 
 _MOST_ROWS: Final = 240
 
@@ -44,7 +44,7 @@ def headline(rows: Sequence[RunRow], meta: Meta) -> Html:
     over = (
         "; a search looks where it expects to learn most, so that this is no share of anything"
         if is_search(meta)
-        else f": {share_text(failing, len(judged))} over all points together"
+        else f", {plain_share(failing, len(judged))} over all points together"
     )
     summary = tag(
         "p",
@@ -62,13 +62,18 @@ def headline(rows: Sequence[RunRow], meta: Meta) -> Html:
 
 
 def _share_of_all(outcome: Outcome, found: int, judged: int) -> str:
-    return "no statement" if outcome in NO_STATEMENT else share_text(found, judged)
+    return "no statement" if outcome in NO_STATEMENT else plain_share(found, judged)
+
+
+def plain_share(part: int, whole: int) -> str:
+    """Without interval: all points have the same seeds, so that their runs depend on each other."""
+    return f"{100 * part / whole:.1f} %" if whole else "none"
 
 
 def outcome_section(rows: Sequence[RunRow], meta: Meta) -> Html:
     """Outcomes by point, each with a bar."""
     counted = outcome_table(rows, meta)
-    at = counted.heads.index(RUNS) + 1
+    at = next(column for column in range(len(counted.heads)) if column not in counted.texts) + 1  # behind the runs
     runs = list(by_point(rows, points_of(rows, meta)).values())
     body: list[list[Content]] = [
         [*cells[:at], bar(stating(found)), *cells[at:]]

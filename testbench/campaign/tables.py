@@ -11,7 +11,6 @@ from testbench.campaign.records import NO_STATEMENT, Outcome, RunRow
 from testbench.campaign.rules import FAILURE
 from testbench.campaign.statistics import wilson
 
-RUNS: Final = "runs with a statement"
 SHARES: Final = {
     FAILURE: "failed",
     BEYOND_3DEG: "failed by more than 3 deg",
@@ -50,7 +49,7 @@ def outcome_table(rows: Sequence[RunRow], meta: Meta) -> Table:
         cells += [share_text(count(judged, what), len(judged)) for what in SHARES]
         cells.append(_noticed(judged))
         body.append((*cells, *([_mute(found)] if mute else [])))
-    heads = (*axes, RUNS, *map(words, judged_seen), *SHARES.values(), "noticed", *(["no statement"] if mute else []))
+    heads = (*axes, "runs", *map(words, judged_seen), *SHARES.values(), "noticed", *(["no statement"] if mute else []))
     texts = {*range(len(axes)), *([len(heads) - 1] if mute else [])}
     return Table("Outcomes by point", heads, tuple(body), frozenset(texts))
 
