@@ -10,8 +10,9 @@ from testbench.campaign.phases import by_phase
 from testbench.campaign.ranking import Effect, Ranking, rank_parameters
 from testbench.campaign.records import RunRow
 from testbench.campaign.rules import FAILURE
-from testbench.campaign.sections import bar, plain_share
+from testbench.campaign.sections import bar
 from testbench.campaign.statistics import NotEstimableError
+from testbench.campaign.tables import plain_share
 
 _BINS: Final = 10
 _TOGETHER: Final = (

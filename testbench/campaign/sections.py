@@ -10,7 +10,7 @@ from testbench.campaign.meta import Meta
 from testbench.campaign.notable import Notable, latest_noticed, odd, replay_command, slowest, worst
 from testbench.campaign.records import NO_STATEMENT, Outcome, RunRow
 from testbench.campaign.rules import FAILURE
-from testbench.campaign.tables import outcome_table, words
+from testbench.campaign.tables import outcome_table, plain_share, words
 
 _MOST_ROWS: Final = 240
 
@@ -32,8 +32,9 @@ def headline(rows: Sequence[RunRow], meta: Meta) -> Html:
     judged = stating(rows)
     mute = Counter(row.outcome for row in rows if row.outcome in NO_STATEMENT)
     missing = meta.wanted - len(rows)
+    where = "" if is_search(meta) else f", at {len(meta.points)} point{_s(len(meta.points))}"
     lines: list[str] = [
-        f"{meta.asked}, at {len(meta.points)} point{_s(len(meta.points))}: {len(rows)} runs made",
+        f"{meta.asked}{where}: {len(rows)} runs made",
         f", {missing} of {meta.wanted} still missing. " if missing > 0 else ". ",
     ]
     if mute:
@@ -63,11 +64,6 @@ def headline(rows: Sequence[RunRow], meta: Meta) -> Html:
 
 def _share_of_all(outcome: Outcome, found: int, judged: int) -> str:
     return "no statement" if outcome in NO_STATEMENT else plain_share(found, judged)
-
-
-def plain_share(part: int, whole: int) -> str:
-    """Without interval: all points have the same seeds, so that their runs depend on each other."""
-    return f"{100 * part / whole:.1f} %" if whole else "none"
 
 
 def outcome_section(rows: Sequence[RunRow], meta: Meta) -> Html:

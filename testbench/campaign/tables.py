@@ -67,6 +67,11 @@ def share_text(part: int, whole: int) -> str:
     return f"{_percent(part / whole)} % ({_percent(interval.low)} to {_percent(interval.high)} %)"
 
 
+def plain_share(part: int, whole: int) -> str:
+    """Without interval, for points taken together: they have the same seeds, so that their runs depend on each other."""
+    return f"{100 * part / whole:.1f} %" if whole else "none"
+
+
 def words(outcome: Outcome) -> str:
     """An outcome as prose."""
     return outcome.value.replace("_", " ")
