@@ -45,7 +45,13 @@ def exo_hil(folder: Path, *arguments: str, maker: str = "") -> subprocess.Popen[
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
+        start_new_session=True,
     )
+
+
+def interrupt(process: subprocess.Popen[str]) -> None:
+    """Ctrl-C as a terminal has it: for the program and all of its processes."""
+    os.killpg(process.pid, signal.SIGINT)
 
 
 def rows_in(path: Path) -> list[RunRow]:
@@ -276,12 +282,12 @@ def test_ctrl_c_keeps_what_was_made_and_leaves_nobody(tmp_path: Path) -> None:
     arguments = ("campaign", "run", str(path), "--out", str(store), "--jobs", "2")
     process = exo_hil(tmp_path, *arguments, maker="hangs_from_3")
     once(process, lambda: has_rows(store, 3) and len(worker_numbers(tmp_path)) == 2)
-    process.send_signal(signal.SIGINT)
+    interrupt(process)
     assert process.stderr is not None
     for line in process.stderr:
         if "Ctrl-C again drops them" in line:
             break
-    process.send_signal(signal.SIGINT)
+    interrupt(process)
     out, err = process.communicate(timeout=300)
     if process.poll() is None or process.returncode != 130:
         raise AssertionError((process.returncode, out, err))

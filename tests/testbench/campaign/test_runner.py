@@ -181,6 +181,22 @@ def test_plan_is_asked_again_as_runs_come_in(store: Store) -> None:
     assert (specs, finished.reused) == ([], 3)
 
 
+class Twins(Plan):
+    """Two points that are one scenario, as a search may come upon them, and one more."""
+
+    def wanted(self, known: Known) -> list[Wanted]:
+        return [Wanted(Point((("duration", text),)), 0) for text in ("0.05 s", "50 ms", "0.3 s")]
+
+
+@pytest.mark.parametrize("room", [1, 5])
+def test_points_that_are_one_scenario_share_a_run(store: Store, room: int) -> None:
+    """Never the same run twice; both points know it."""
+    finished, specs = run(small(), store, Here(room=room), plan=Twins())
+    assert len({spec.identity for spec in specs}) == len(specs) == 2
+    assert finished.progress.done == 3
+    assert not finished.interrupted
+
+
 def test_rows_are_the_same_in_whatever_order_runs_finish(store: Store, tmp_path: Path) -> None:
     """A sequential rule on one process and on seven."""
     rule = "runs: {until: {outcome: failure, width: 0.5}, batch: 4, least: 4, most: 40}"
