@@ -278,7 +278,7 @@ def _status(options: argparse.Namespace, show: Callable[[str], None]) -> int:
         wanted = int(store.meta("wanted") or len(rows))
         last = made[-1] if made else None
         rate = 60 * last.made / last.wall_s if last is not None and last.wall_s > 0 else 0.0
-        how = "never run" if last is None else last.how if last.how != "running" or store.is_held() else "killed"
+        how = "never run" if last is None else last.how if last.how != "running" or store.is_held() else "broken off"
         document = {"campaign": store.meta("name"), "state": how, **_counts(store, rows)}
         document |= {"wanted": wanted, "runs_per_min": rate, "points": _points(store, rows)}
         if options.json:

@@ -17,6 +17,17 @@ EXCEEDED: Final = "exceeded"
 BEYOND_3DEG: Final = "beyond_3deg"
 """A joint beyond its range by more than 3 deg, because mechanical pins are soft."""
 
+_NAMED: Final = {
+    "beyond_deg": ("angle beyond the range of travel", "deg"),
+    "beyond_s": ("time beyond the range of travel", "s"),
+    "detection_latency_s": ("time from the first fault to the first reaction", "s"),
+    "detected_s": ("time of the first reaction", "s"),
+    "first_start_s": ("start of the first fault", "s"),
+    "first_phase": ("gait phase of the first fault", ""),
+    "failure_s": ("time of the first failure", "s"),
+    "ended_s": ("end of the motion", "s"),
+}
+"""Numbers of a run, which belong to no joint."""
 _UNITS: Final = (("_rad_s", "rad/s"), ("_rad", "rad"), ("_nm", "N m"), ("_deg", "deg"), ("_rpm", "rpm"), ("_s", "s"))
 
 
@@ -36,6 +47,8 @@ class Quantity:
 
 def quantity(name: str) -> Quantity:
     """`right_knee.rmse_position_rad` -> right knee, position RMSE, rad."""
+    if name in _NAMED:
+        return Quantity(name, *_NAMED[name])
     joint, dot, what = name.rpartition(".")
     unit, words = "", what
     for ending, found in _UNITS:

@@ -7,7 +7,7 @@ units beside the same paper's numbers; where there are too many, all are taken t
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from testbench.campaign.axes import Axis
 from testbench.campaign.figures import (
@@ -37,23 +37,31 @@ from testbench.campaign.sections import motion_note
 from testbench.campaign.statistics import Interval, NotEstimableError, wilson
 from testbench.campaign.tables import Table, number
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as DrawnFigure
+
 _MOST_PANELS: Final = 6
 _CURVE_POINTS: Final = 60
 _LEAST_FOR_FIT: Final = 4
 """Places on x; through three a parabola always goes."""
 _APART: Final = 0.3
 """Of the least distance of two x: how far to either side dots stand."""
+_NO_INTERVALS: Final = " Without intervals: runs with the same seeds are taken together, and depend on each other."
 _GOLDEN_RATIO: Final = 0.618034
 """Its multiples, modulo 1, lie far apart."""
 
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """A figure wanted, for one combination of the other axes (`held`, in words), with its runs by rising x."""
+    """A figure wanted, for one combination of the other axes (`held`, in words), with its runs by rising x.
+
+    together: for all combinations instead. Runs at one x then share seeds and depend on each other: no intervals.
+    """
 
     wanted: Figure
     axis: Axis
     held: str
+    together: bool
     columns: tuple[tuple[float, tuple[RunRow, ...]], ...]
 
     @property
@@ -81,19 +89,20 @@ def _panels(rows: Sequence[RunRow], meta: Meta, wanted: Figure) -> Iterator[Pane
             held = tuple(pair for pair in point.parameters if pair[0] != axis.name)
             inside.setdefault(held, {}).setdefault(x, []).extend(found)
     if len(inside) > _MOST_PANELS:
-        together: dict[float, list[RunRow]] = {}
+        pooled: dict[float, list[RunRow]] = {}
         for columns in inside.values():
             for x, found in columns.items():
-                together.setdefault(x, []).extend(found)
+                pooled.setdefault(x, []).extend(found)
         names = " and ".join(one.name for one in meta.axes if one is not axis)
-        yield _panel(wanted, axis, f"all values of {names} together", together)
+        yield _panel(wanted, axis, f"all values of {names} together", pooled, together=True)
         return
     for held, columns in inside.items():
-        yield _panel(wanted, axis, ", ".join(f"{name} {text}" for name, text in held), columns)
+        words = ", ".join(f"{name} {text}" for name, text in held)
+        yield _panel(wanted, axis, words, columns, together=False)
 
 
-def _panel(wanted: Figure, axis: Axis, held: str, columns: dict[float, list[RunRow]]) -> Panel:
-    return Panel(wanted, axis, held, tuple((x, tuple(columns[x])) for x in sorted(columns)))
+def _panel(wanted: Figure, axis: Axis, held: str, columns: dict[float, list[RunRow]], *, together: bool) -> Panel:
+    return Panel(wanted, axis, held, together, tuple((x, tuple(columns[x])) for x in sorted(columns)))
 
 
 def figure_section(rows: Sequence[RunRow], meta: Meta) -> tuple[Html | None, int]:
@@ -106,32 +115,44 @@ def figure_section(rows: Sequence[RunRow], meta: Meta) -> tuple[Html | None, int
 
 
 def _figure(panel: Panel, k: int) -> Html | None:
-    y = panel.wanted.y
-    title = panel_title(panel)
-    if is_share(y):
-        shares = []
-        for x, rows in panel.columns:
-            if rows:
-                part = count(rows, y)
-                interval = wilson(part, len(rows))
-                shares.append(Share(x, part / len(rows), interval.low, interval.high))
-        if not shares:
-            return None
-        figure = share_figure(shares, panel.wanted.paper, (panel.x_label, f"{y.replace('_', ' ')} [% of runs]"))
-        said = f"Share of {len(panel.rows)} runs, with its Wilson interval at 95 %."
-    else:
-        described = described_columns(panel)
-        if not described:
-            return None
-        dots = _dots(panel)
-        fits = fits_of(panel)
-        labels = (panel.x_label, quantity(y).label)
-        figure = metric_figure(dots, [_column(one) for one in described], _curve(fits), panel.wanted.paper, labels)
-        said = f"{len(dots)} runs, each a dot.{_fit_words(fits)}{motion_note(panel.rows)}"
-    text = " ".join(f"{x:g}: {y:g};" for x, y in panel.wanted.paper)
-    description = f"{said} The numbers are in the tables below." + (f" The paper: {text}" if text else "")
+    """One figure with its caption; None without a run that has a number for it."""
+    drawn = _of_shares(panel) if is_share(panel.wanted.y) else _of_metric(panel)
+    if drawn is None:
+        return None
+    figure, said = drawn
+    said += _NO_INTERVALS if panel.together else ""
+    title, paper = panel_title(panel), "; ".join(f"{x:g}: {y:g}" for x, y in panel.wanted.paper)
+    description = f"{said} The numbers are in the tables below." + (f" The paper: {paper}." if paper else "")
     svg = inline_svg(figure, k, title, description)
     return tag("figure", svg, tag("figcaption", tag("b", f"Figure {k}. {title}. "), said))
+
+
+def _of_shares(panel: Panel) -> tuple["DrawnFigure", str] | None:
+    """(figure, what is said below it)."""
+    y, shares = panel.wanted.y, []
+    for x, rows in panel.columns:
+        if rows:
+            part = count(rows, y)
+            share, interval = part / len(rows), wilson(part, len(rows))
+            low, high = (share, share) if panel.together else (interval.low, interval.high)
+            shares.append(Share(x, share, low, high))
+    if not shares:
+        return None
+    labels = (panel.x_label, f"{y.replace('_', ' ')} [% of runs]")
+    interval_words = "" if panel.together else ", with its Wilson interval at 95 %"
+    return share_figure(shares, panel.wanted.paper, labels), f"Share of {len(panel.rows)} runs{interval_words}."
+
+
+def _of_metric(panel: Panel) -> tuple["DrawnFigure", str] | None:
+    """(figure, what is said below it)."""
+    described = described_columns(panel)
+    if not described:
+        return None
+    dots, fits = _dots(panel), fits_of(panel)
+    labels = (panel.x_label, quantity(panel.wanted.y).label)
+    columns = [_column(one) for one in described]
+    figure = metric_figure(dots, columns, _curve(fits), panel.wanted.paper, labels)
+    return figure, f"{len(dots)} runs, each a dot.{_fit_words(fits)}{motion_note(panel.rows)}"
 
 
 def _dots(panel: Panel) -> list[tuple[float, float]]:
@@ -155,7 +176,7 @@ def panel_title(panel: Panel) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Described:
-    """The values of y at one x. mean: the interval of the mean, None for one value, or where all are equal."""
+    """The values of y at one x. mean: interval of the mean, None for one value, for equal ones, for dependent runs."""
 
     x: float
     values: Summary
@@ -165,7 +186,11 @@ class Described:
 def described_columns(panel: Panel) -> list[Described]:
     """What is said about the values at every x with runs that have one."""
     found = ((x, values_of(rows, panel.wanted.y)) for x, rows in panel.columns)
-    return [Described(x, summary(values), _mean_interval(values)) for x, values in found if values]
+    return [
+        Described(x, summary(values), None if panel.together else _mean_interval(values))
+        for x, values in found
+        if values
+    ]
 
 
 def _mean_interval(values: Sequence[float]) -> Interval | None:

@@ -170,6 +170,10 @@ class Runner:
             if spec.identity in self._state.in_flight:  # two points of a search that are one scenario
                 self._queue.append(wanted)
                 return
+            made = self._stored.get(spec.identity)
+            if made is not None:
+                self._state.add(replace(made, point=wanted.point, number=wanted.number))
+                continue
             self._state.in_flight[spec.identity] = wanted
             executor.submit(spec)
 

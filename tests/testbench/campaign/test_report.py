@@ -144,7 +144,8 @@ def test_shares_leave_out_what_makes_no_statement_and_say_so() -> None:
     rows = [row(at, k, outcome) for k, outcome in enumerate(outcomes)]
     said = words(rows, meta([axis("duration", "0.1 s")], [at], wanted=4))
     assert "4 runs made. 1 of them makes no statement (1 hang) and is in no share below." in said
-    assert "1 of 3 runs failed: 33.3 % (6.1 to 79.2 %)" in said
+    assert "1 of 3 runs failed, 33.3 % over all points together." in said
+    assert "33.3 % (6.1 to 79.2 %)" in said
     assert "In 2 runs a limit of torque, speed or angle was exceeded." in said
 
 
@@ -186,7 +187,10 @@ def test_too_many_combinations_are_taken_together_and_the_figure_says_so() -> No
         points += more
         rows += made
     said = words(rows, meta([axis("duration", "0.1 s"), axis("phase", *phases)], points, [figure()]))
-    assert "over duration, all values of phase together. 7 runs, each a dot." in said
+    assert (
+        "over duration, all values of phase together. 7 runs, each a dot. Without intervals: runs with the same seeds"
+        in said
+    )
 
 
 def test_runs_are_counted_by_the_phase_of_their_first_fault() -> None:
@@ -199,8 +203,9 @@ def test_runs_are_counted_by_the_phase_of_their_first_fault() -> None:
         row(at, 3, Outcome.NOT_ACTIVATED, first_phase=None),
     ]
     said = words(rows, meta([axis("duration", "0.1 s")], [at]))
-    assert "90 to 100 %250.0 % (9.5 to 90.5 %)12.5" in said
-    assert "0 to 10 %10 % (0 to 79.3 %)0.0" in said
+    assert "90 to 100 %2250.0 %12.5" in said  # 2 runs of 2 seeds
+    assert "0 to 10 %110.0 %0.0" in said
+    assert "there are no intervals here" in said
     assert "In 1 of these 3 runs more than one window of a fault opened." in said
 
 
