@@ -234,7 +234,10 @@ def values_section(rows: Sequence[RunRow], meta: Meta) -> Html | None:
     tables = [table(one.caption, one.heads, one.body, one.texts) for one in values_tables(rows, meta)]
     if not tables:
         return None
-    note = "Mean with its 95 % interval; quartiles: a quarter of the runs below the first, a quarter above the second."
+    note = (
+        "Mean with its 95 % interval (Student's t); quartiles: a quarter of the runs below the first, a quarter above "
+        "the second. Behind a published number stands whether it is inside the interval of our mean, below or above it."
+    )
     heading = tag("h2", "Numbers of the figures")
     return tag("section", heading, *tables, tag("p", note, class_="note"), id="values")
 
@@ -260,10 +263,17 @@ def _values_table(panel: Panel, described: Sequence[Described]) -> Table:
             number(found.low),
             number(found.high),
         ]
-        body.append((*cells, *([f"{paper[one.x]:g}" if one.x in paper else ""] if paper else [])))
+        body.append((*cells, *([_beside(paper.get(one.x), one.mean)] if paper else [])))
     unit = quantity(panel.wanted.y).unit
     caption = f"{panel_title(panel)}{f', in {unit}' if unit else ''}"
     return Table(caption, (*heads, *(["the paper"] if paper else [])), tuple(body), frozenset())
+
+
+def _beside(paper: float | None, ours: Interval | None) -> str:
+    """A published number, and where it lies beside the interval of our mean."""
+    if paper is None or ours is None:
+        return "" if paper is None else f"{paper:g}"
+    return f"{paper:g} ({'below' if paper < ours.low else 'above' if paper > ours.high else 'inside'})"
 
 
 def _ends(interval: Interval | None) -> str:
