@@ -135,7 +135,11 @@ def words_of(point: Point) -> str:
     return ", ".join(f"{name} {text}" for name, text in point.parameters) or "the scenario as it is"
 
 
-def ended_early(rows: Iterable[RunRow]) -> int:
-    """Runs whose motion was cut short, so that their metrics cover less of it than those of others."""
-    ends = [row.ended_s for row in rows if row.ended_s is not None]
-    return sum(end < max(ends) - 1e-9 for end in ends)
+def motion_of(rows: Iterable[RunRow]) -> float:
+    """The longest motion that was judged [s], 0 without any: that of a run which nothing cut short."""
+    return max((row.ended_s for row in rows if row.ended_s is not None), default=0.0)
+
+
+def ended_early(rows: Iterable[RunRow], motion_s: float) -> int:
+    """Runs whose motion was shorter than that, so that their metrics cover less of it than those of others."""
+    return sum(row.ended_s is not None and row.ended_s < motion_s - 1e-9 for row in rows)

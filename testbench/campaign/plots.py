@@ -23,7 +23,9 @@ from testbench.campaign.markup import Html, table, tag
 from testbench.campaign.measured import (
     by_point,
     count,
+    ended_early,
     is_share,
+    motion_of,
     number_at,
     quantity,
     stating,
@@ -33,7 +35,6 @@ from testbench.campaign.meta import Meta
 from testbench.campaign.records import RunRow
 from testbench.campaign.rules import Figure
 from testbench.campaign.samples import Summary, mean_interval, summary
-from testbench.campaign.sections import motion_note
 from testbench.campaign.statistics import Interval, NotEstimableError, wilson
 from testbench.campaign.tables import Table, number
 
@@ -55,13 +56,15 @@ _GOLDEN_RATIO: Final = 0.618034
 class Panel:
     """A figure wanted, for one combination of the other axes (`held`, in words), with its runs by rising x.
 
-    together: for all combinations instead. Runs at one x then share seeds and depend on each other: no intervals.
+    motion_s: of a run that nothing cut short. together: for all combinations instead; runs at one x then share seeds
+    and depend on each other, so that there are no intervals.
     """
 
     wanted: Figure
     axis: Axis
     held: str
     together: bool
+    motion_s: float
     columns: tuple[tuple[float, tuple[RunRow, ...]], ...]
 
     @property
@@ -81,6 +84,7 @@ def panels(rows: Sequence[RunRow], meta: Meta) -> list[Panel]:
 
 
 def _panels(rows: Sequence[RunRow], meta: Meta, wanted: Figure) -> Iterator[Panel]:
+    motion_s = motion_of(rows)
     (axis,) = (axis for axis in meta.axes if axis.name == wanted.x)
     inside: dict[tuple[tuple[str, str], ...], dict[float, list[RunRow]]] = {}
     for point, found in by_point(rows, meta.points).items():
@@ -94,15 +98,15 @@ def _panels(rows: Sequence[RunRow], meta: Meta, wanted: Figure) -> Iterator[Pane
             for x, found in columns.items():
                 pooled.setdefault(x, []).extend(found)
         names = " and ".join(one.name for one in meta.axes if one is not axis)
-        yield _panel(wanted, axis, f"all values of {names} together", pooled, together=True)
+        yield Panel(wanted, axis, f"all values of {names} together", True, motion_s, _by_x(pooled))
         return
     for held, columns in inside.items():
         words = ", ".join(f"{name} {text}" for name, text in held)
-        yield _panel(wanted, axis, words, columns, together=False)
+        yield Panel(wanted, axis, words, False, motion_s, _by_x(columns))
 
 
-def _panel(wanted: Figure, axis: Axis, held: str, columns: dict[float, list[RunRow]], *, together: bool) -> Panel:
-    return Panel(wanted, axis, held, together, tuple((x, tuple(columns[x])) for x in sorted(columns)))
+def _by_x(columns: dict[float, list[RunRow]]) -> tuple[tuple[float, tuple[RunRow, ...]], ...]:
+    return tuple((x, tuple(columns[x])) for x in sorted(columns))
 
 
 def figure_section(rows: Sequence[RunRow], meta: Meta) -> tuple[Html | None, int]:
@@ -152,7 +156,7 @@ def _of_metric(panel: Panel) -> tuple["DrawnFigure", str] | None:
     labels = (panel.x_label, quantity(panel.wanted.y).label)
     columns = [_column(one) for one in described]
     figure = metric_figure(dots, columns, _curve(fits), panel.wanted.paper, labels)
-    return figure, f"{len(dots)} runs, each a dot.{_fit_words(fits)}{motion_note(panel.rows)}"
+    return figure, f"{len(dots)} runs, each a dot.{_fit_words(fits)}{_cut_words(panel)}"
 
 
 def _dots(panel: Panel) -> list[tuple[float, float]]:
@@ -230,7 +234,10 @@ def values_section(rows: Sequence[RunRow], meta: Meta) -> Html | None:
     tables = [table(one.caption, one.heads, one.body, one.texts) for one in values_tables(rows, meta)]
     if not tables:
         return None
-    note = "Mean with its 95 % interval; quartiles: a quarter of the runs below the first, a quarter above the second."
+    note = (
+        "Mean with its 95 % interval (Student's t); quartiles: a quarter of the runs below the first, a quarter above "
+        "the second. Behind a published number stands whether it is inside the interval of our mean, below or above it."
+    )
     heading = tag("h2", "Numbers of the figures")
     return tag("section", heading, *tables, tag("p", note, class_="note"), id="values")
 
@@ -256,10 +263,17 @@ def _values_table(panel: Panel, described: Sequence[Described]) -> Table:
             number(found.low),
             number(found.high),
         ]
-        body.append((*cells, *([f"{paper[one.x]:g}" if one.x in paper else ""] if paper else [])))
+        body.append((*cells, *([_beside(paper.get(one.x), one.mean)] if paper else [])))
     unit = quantity(panel.wanted.y).unit
     caption = f"{panel_title(panel)}{f', in {unit}' if unit else ''}"
     return Table(caption, (*heads, *(["the paper"] if paper else [])), tuple(body), frozenset())
+
+
+def _beside(paper: float | None, ours: Interval | None) -> str:
+    """A published number, and where it lies beside the interval of our mean."""
+    if paper is None or ours is None:
+        return "" if paper is None else f"{paper:g}"
+    return f"{paper:g} ({'below' if paper < ours.low else 'above' if paper > ours.high else 'inside'})"
 
 
 def _ends(interval: Interval | None) -> str:
@@ -278,6 +292,15 @@ def _curve(fits: Fits | None) -> Curve | None:
     fit = fits.runs
     steps = [fit.low + (fit.high - fit.low) * k / _CURVE_POINTS for k in range(_CURVE_POINTS + 1)]
     return Curve(steps, [fit.at(x) for x in steps])
+
+
+def _cut_words(panel: Panel) -> str:
+    """What has to be said under numbers of runs that were cut short, "" for none."""
+    early = ended_early(panel.rows, panel.motion_s)
+    if not early:
+        return ""
+    subject, their = ("1 run", "its") if early == 1 else (f"{early} runs", "their")
+    return f" {subject} ended early: {their} numbers cover a part of the motion."
 
 
 def _fit_words(fits: Fits | None) -> str:

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from typing import Final
 
 from testbench.campaign.markup import Content, Html, table, tag
-from testbench.campaign.measured import EXCEEDED, by_point, count, ended_early, is_search, points_of, stating, words_of
+from testbench.campaign.measured import EXCEEDED, by_point, count, is_search, points_of, stating, words_of
 from testbench.campaign.meta import Meta
 from testbench.campaign.notable import Notable, latest_noticed, odd, replay_command, slowest, worst
 from testbench.campaign.records import NO_STATEMENT, Outcome, RunRow
@@ -112,16 +112,6 @@ def _notable(one: Notable, store: str) -> Html:
     row = one.row
     where = f"{words_of(row.point)}; run {row.number}, seed {row.seed}; {words(row.outcome)}"
     return tag("li", tag("strong", one.why), f": {where}", tag("br"), tag("code", replay_command(store, row)))
-
-
-def motion_note(rows: Sequence[RunRow]) -> str:
-    """What has to be said under numbers of runs that were cut short, "" for none."""
-    early = ended_early(rows)
-    if not early:
-        return ""
-    return (
-        f" {early} run{_s(early)} ended early: {'its' if early == 1 else 'their'} numbers cover a part of the motion."
-    )
 
 
 def bar(rows: Sequence[RunRow]) -> Html:

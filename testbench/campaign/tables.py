@@ -68,7 +68,7 @@ def share_text(part: int, whole: int) -> str:
 
 
 def plain_share(part: int, whole: int) -> str:
-    """Without interval, for points taken together: they have the same seeds, so that their runs depend on each other."""
+    """Without interval, for points taken together: with the same seeds, their runs depend on each other."""
     return f"{100 * part / whole:.1f} %" if whole else "none"
 
 

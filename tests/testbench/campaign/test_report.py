@@ -126,7 +126,15 @@ def test_numbers_of_a_figure_stand_beside_the_papers() -> None:
     about = meta([axis("duration", "0.1 s")], points, [figure(paper=((0.1, 2.5),))])
     html = html_text(rows, about)
     cells = re.findall(r"<t[dh][^>]*>(.*?)</t[dh]>", html[html.index('id="values"') :].split("</section>")[0])
-    assert cells[8:] == ["0.1", "3", "3 (-3.57 to 9.57)", "2", "1.5, 4", "1", "6", "2.5"]
+    assert cells[8:] == ["0.1", "3", "3 (-3.57 to 9.57)", "2", "1.5, 4", "1", "6", "2.5 (inside)"]
+
+
+@pytest.mark.parametrize(("paper", "said"), [(-3.6, "below"), (-3.5, "inside"), (9.5, "inside"), (9.6, "above")])
+def test_published_number_is_said_to_be_inside_or_not(paper: float, said: str) -> None:
+    """Against the interval of our mean, -3.57 to 9.57 for 1, 2, 6; so no reader has to compare digits."""
+    points, rows = over_duration(["0.1 s"], {"0.1 s": [1, 6, 2]})
+    about = meta([axis("duration", "0.1 s")], points, [figure(paper=((0.1, paper),))])
+    assert f">{paper:g} ({said})<" in html_text(rows, about)
 
 
 def test_part_of_an_axis_is_shown_and_fitted_alone() -> None:
