@@ -2,8 +2,9 @@
 
 A fault may drop, change, delay and add frames of its target while its window is open, and what it has put off leaves
 later. So within a window, one cycle more on either side, frames of the COB-IDs it is at are not looked for, in the
-directions it is at; after the first window a frame more of those is no surprise, nor one of any id where a fault has
-added frames. Everything else that came in leaves once, as it came, in its order.
+directions it is at; what came in behind frames that were put off has to wait for them, and is not late for that. After
+the first window a frame more of those ids is no surprise, nor one of any id where a fault has added frames. Everything
+else that came in leaves once, as it came, in its order.
 """
 
 from bisect import bisect_right
@@ -26,12 +27,13 @@ _FROM_DRIVES: Final = 1
 
 @dataclass(slots=True)
 class _Windows:
-    """When faults were active. spans: by target, rising, apart; firsts: when the first one began.
+    """When faults were active. spans: by target, rising, apart; delays: those in which frames were put off.
 
     adds_from: from when on frames of other ids may have been added.
     """
 
     spans: dict[Where, list[tuple[int, int]]]
+    delays: dict[Where, list[tuple[int, int]]]
     adds_from: int
 
     def has(self, where: Where, row: Transmission) -> bool:
@@ -39,6 +41,23 @@ class _Windows:
         spans = self.spans.get(where, [])
         at = bisect_right(spans, (row.end_ns, NEVER)) - 1
         return at >= 0 and row.end_ns < spans[at][1]
+
+    def punctual(self, where: Where, one: Pairing) -> list[tuple[Transmission, Transmission]]:
+        """The pairs that no fault had to do with: neither within a window, nor behind what one put off."""
+        delays = self.delays.get(where, [])
+        held_ns = [-NEVER] * len(delays)  # when the last frame that each put off left
+        for row in one.extra:
+            at = bisect_right(delays, (row.end_ns, NEVER)) - 1
+            if at >= 0:
+                held_ns[at] = row.end_ns
+        found = []
+        for before, row in one.pairs:
+            at = bisect_right(delays, (before.end_ns, NEVER)) - 1
+            if at >= 0 and before.end_ns < delays[at][1]:
+                held_ns[at] = max(held_ns[at], row.end_ns)
+            if not self.has(where, before) and (at < 0 or before.end_ns >= held_ns[at]):
+                found.append((before, row))
+        return found
 
     def explains(self, where: Where, row: Transmission) -> bool:
         """Whether a fault may have made that frame, which left and had not come in."""
@@ -68,7 +87,7 @@ def pass_through(gateway: GatewayPart, plan: BusPlan, until_ns: int, slack_ns: i
     found: dict[Where, Pairing] = {}
     for where in came.keys() | left.keys():
         one = pair(came.get(where, []), left.get(where, []), slack_ns)
-        one.pairs = [both for both in one.pairs if not windows.has(where, both[0])] + at_once.get(where, [])
+        one.pairs = windows.punctual(where, one) + at_once.get(where, [])
         one.missing = [row for row in one.missing if row.end_ns < until_ns and not windows.has(where, row)]
         one.extra = [row for row in one.extra if not windows.explains(where, row)]
         found[where] = one
@@ -83,6 +102,7 @@ def _is_same(arrival: Transmission, sending: Transmission) -> bool:
 
 def _windows(gateway: GatewayPart, plan: BusPlan) -> _Windows:
     spans: dict[Where, list[tuple[int, int]]] = {}
+    delays: dict[Where, list[tuple[int, int]]] = {}
     adds_from = NEVER
     for one in sorted(gateway.activations, key=lambda one: one.start_ns):
         reach = gateway.injectors[one.injector]
@@ -90,12 +110,14 @@ def _windows(gateway: GatewayPart, plan: BusPlan) -> _Windows:
         if reach.reports or _adds(one):
             adds_from = min(adds_from, start)
         for where in _targets(reach):
+            if one.frames_delayed:
+                delays.setdefault(where, []).append((start, end))
             known = spans.setdefault(where, [])
             if known and start <= known[-1][1]:
                 known[-1] = (known[-1][0], max(known[-1][1], end))
             else:
                 known.append((start, end))
-    return _Windows(spans, adds_from)
+    return _Windows(spans, delays, adds_from)
 
 
 def _targets(reach: Reach) -> list[Where]:

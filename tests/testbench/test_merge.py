@@ -365,6 +365,58 @@ def test_doubled_frame_is_excused_only_where_a_fault_has_been(
     assert any(reason.startswith(where) for reason in timing.lost) == found
 
 
+DELAYS = """\
+  slow:
+    target: {bus: to_controller, node: right_knee, pdo: TPDO1}
+    fault: {type: delay, time: 100 ms}
+    event: {type: at, times: [0.2 s, 0.6 s]}
+    effect: {type: constant_time, duration: 0.05 s}
+"""
+
+
+@pytest.fixture(scope="module")
+def put_off() -> tuple[Scenario, Parts]:
+    """A run in which the TPDO1 of the right knee are 100 ms late, twice."""
+    scenario = parse_scenario(SCENARIO.partition("injectors:\n")[0] + "injectors:\n" + DELAYS)
+    rig = build_rig(rig_params(scenario), build_injectors(scenario.injectors, scenario.plan, scenario.seed, 0))
+    drive_through(rig, lambda share: None)
+    return scenario, parts_of(rig)
+
+
+def test_frames_behind_those_that_a_fault_put_off_are_not_late(put_off: tuple[Scenario, Parts]) -> None:
+    """In order they wait, also after the window; the run is as valid as any."""
+    scenario, (hlc, gateway, joints) = put_off
+    assert [one.frames_delayed for one in gateway.activations] == [5, 5]
+    timing = judged(scenario, hlc, gateway, joints)
+    assert (timing.lost, timing.late) == ([], {})
+
+
+@pytest.mark.parametrize(("at_ms", "cob_id"), [(450, 0x185), (380, 0x185), (270, 0x186)])
+def test_frame_that_waits_for_no_such_frame_is_late(put_off: tuple[Scenario, Parts], at_ms: int, cob_id: int) -> None:
+    """Between two windows, when all that was put off has left; and one of another joint."""
+    scenario, (hlc, gateway, joints) = put_off
+    start = hlc.time_zero + at_ms * MS
+    at = next(
+        at
+        for at, row in enumerate(gateway.rows)
+        if row.frame.can_id == cob_id and row.sender >= 0 and row.end_ns >= start
+    )
+    row = gateway.rows[at]
+    late = row.end_ns + 8 * MS + CYCLE
+    rows = [*gateway.rows[:at], *gateway.rows[at + 1 :]]
+    to = next(to for to, one in enumerate(rows) if one.end_ns >= late)
+    rows.insert(to, Transmission(late, 0, row.frame, row.sender))
+    following = next(
+        to
+        for to, one in enumerate(rows)
+        if to >= at and one.frame.can_id == cob_id and one.bus == 0 and one.sender >= 0
+    )
+    assert following < to  # one overtakes it, unless it waits too
+    rows.insert(to, rows.pop(following))
+    timing = judged(scenario, hlc, replace(gateway, rows=rows), joints)
+    assert timing.late
+
+
 def test_frame_that_waits_in_the_gateway_is_late_from_when_it_came(scenario: Scenario, parts: Parts) -> None:
     """Its transmit queue stands still for three cycles while newer frames of that id come in behind it."""
     hlc, gateway, joints = parts
