@@ -28,7 +28,7 @@ from typing import Final, final
 from mypy_extensions import mypyc_attr
 
 from canopen_exo.bus.frame import Frame
-from canopen_exo.bus.node import MS, NEVER, ErrorState, Out, PortState, Relay
+from canopen_exo.bus.node import MS, NEVER, PASS_ON, TAKE, ErrorState, Out, PortState, Relay
 from canopen_exo.plan import STATUS_MOTION, STATUS_STOPPED
 from canopen_exo.sync import SyncCadence
 from fi_gateway.activation import Activation
@@ -42,6 +42,7 @@ DRIVE_PORT: Final = 1
 
 _STATE: Final = (
     "wake_at",
+    "filters",
     "frames",
     "undelivered",
     "notices",
@@ -53,7 +54,7 @@ _STATE: Final = (
     "_states",
     "_away",
     "_probe_at",
-    "is_disturbed",
+    "_is_disturbed",
 )
 """What `__reduce__` copies besides the constructor arguments; the routes are laid afresh, and what is attached stays
 with the original."""
@@ -144,6 +145,7 @@ class Gateway(Relay):
         self._states: list[ErrorState] = [ErrorState.ERROR_ACTIVE, ErrorState.ERROR_ACTIVE]
         self._away: list[bool] = [False, False]
         self._probe_at: list[int] = [0, 0]
+        self._is_disturbed: bool = False
         self._passage: Final[Passage] = passage if passage is not None else Passage(self.injectors)
         self._from_controller: Final[list[Route | None]] = self._passage.from_controller
         self._from_drives: Final[list[Route | None]] = self._passage.from_drives
@@ -186,7 +188,7 @@ class Gateway(Relay):
                 if left is None:
                     return
                 frame = left
-        if self.is_disturbed:
+        if self._is_disturbed:
             self._came_in(now, port)
             if not self._can_send(now, 1 - port):
                 self.undelivered[port] += 1
@@ -283,10 +285,11 @@ class Gateway(Relay):
         return Gateway, (self.injectors, self._cycle_ns, self._passage), state
 
     def _note_passes(self) -> None:
-        """Say which frames need nothing from here."""
+        """Say which frames need nothing from here: none while a port is away."""
         for port, table in ((CONTROLLER_PORT, self._from_controller), (DRIVE_PORT, self._from_drives)):
+            filters = self.filters[port]
             for cob_id, route in enumerate(table):
-                self.passes[port][cob_id] = 1 if route is None else 0
+                filters[cob_id] = PASS_ON if route is None and not self._is_disturbed else TAKE
 
     def _power_on(self, now: int) -> None:
         """The first frame: start the injectors that count from here."""
@@ -353,7 +356,7 @@ class Gateway(Relay):
         if passage.outbox:
             outbox, passage.outbox = passage.outbox, []
             for port, frame in outbox:
-                if self.is_disturbed and not self._can_send(now, port):
+                if self._is_disturbed and not self._can_send(now, port):
                     self.undelivered[1 - port] += 1
                 else:
                     out.send(port, frame)
@@ -366,7 +369,9 @@ class Gateway(Relay):
         self.port_changes.append(PortChange(now, port, state, cause))
         self._away[port] = state is ErrorState.BUS_OFF or state is ErrorState.DOWN
         self._probe_at[port] = now + _PROBE_NS
-        self.is_disturbed = self._away[0] or self._away[1]
+        if self._is_disturbed is not (self._away[0] or self._away[1]):
+            self._is_disturbed = not self._is_disturbed
+            self._note_passes()
 
     def _came_in(self, now: int, port: int) -> None:
         """A frame has come in: the port is there."""

@@ -103,8 +103,6 @@ class Wire(Wiring):
         else:
             waiting.remove(first)
         medium.on_wire = first
-        medium.frames += 1
-        medium.busy_ns += bits * medium.bit_ns
         medium.end = now + bits * medium.bit_ns
         medium.is_watched = self._is_charged or not self._is_calm
 
@@ -184,7 +182,6 @@ class Wire(Wiring):
         self._steps = steps
         if offers:
             medium.on_wire = offers[0]
-        medium.busy_ns += bits * medium.bit_ns
         medium.is_watched = True
         medium.is_restless = False
         medium.end = self._time(steps[0])
@@ -239,7 +236,6 @@ class Wire(Wiring):
                 can_id, data = write_bus_error(step.error)
                 events.append(WireEvent(Frame(can_id, data, FLAG_ERROR), step.port, []))
             elif step.frame is not None:
-                medium.frames += 1
                 if step.frame != self._sent:
                     self._blame(now)
                 events.append(WireEvent(step.frame, step.port, step.ports))
