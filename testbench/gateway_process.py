@@ -240,7 +240,7 @@ def _other_rate(control: LiveControl, counts_cycles: bool) -> str:
 
 
 def _leave_part(options: ProcessOptions, process: Session, control: LiveControl) -> None:
-    from testbench.parts import ControlNote, GatewayPart, write_gateway
+    from testbench.parts import ControlNote, GatewayPart, reach_of, write_gateway
 
     assert options.part is not None
     gateway = control.gateway
@@ -251,7 +251,7 @@ def _leave_part(options: ProcessOptions, process: Session, control: LiveControl)
     part = GatewayPart(
         service,
         gateway.time_zero,
-        len(gateway.injectors),
+        {one.name: reach_of(one) for one in gateway.injectors},
         list(gateway.frames),
         list(gateway.lost),
         process.loop.latency,
