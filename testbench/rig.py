@@ -103,9 +103,7 @@ def build_master(params: RigParams, mjcf: str, cycles: int = -1) -> tuple[Master
     """The high-level controller on the bus. cycles: of the motion; -1 for the duration in `params`."""
     plan = params.plan
     names = tuple(joint.name for joint in plan.joints)
-    law = build_controller(
-        paper_params(names, plan.cycle_ns, params.stride_ns), names, packaged_recording(), mjcf
-    )
+    law = build_controller(paper_params(names, plan.cycle_ns, params.stride_ns), names, packaged_recording(), mjcf)
     controller = HighLevelController(plan, law, params.duration_ns // plan.cycle_ns if cycles < 0 else cycles)
     return Master(plan, tuple(_slave(plan, joint) for joint in plan.joints), controller), controller
 

@@ -69,9 +69,9 @@ class Node:
     """Something on a bus: a controller, a device, a rack of devices, a gateway.
 
     wake_at: absolute time [ns] of the next call to `wake`, NEVER for none; read afresh before every wait.
-    filters: acceptance filters, as in a CAN controller: by port and 11-bit id, IGNORE where `receive` does nothing
-    with a base data frame, so that a loop need not call it, else TAKE; none at all for a node that takes everything.
-    The node may change what stands in them at any time, but not take others.
+    filters: acceptance filters, as a CAN controller has them: by port and 11-bit id, IGNORE where `receive` does
+    nothing with a base data frame, so that a loop need not call it, else TAKE; none at all for a node that takes
+    everything. The node may change what stands in them at any time, but not take others.
     """
 
     def __init__(self) -> None:
@@ -100,7 +100,8 @@ class Relay(Node):
     """A node with two ports, 0 and 1, that passes most frames on from one to the other, at once and unchanged.
 
     frames: received so far, by port. filters: PASS_ON where all that `receive` does with a base data frame is to count
-    it in `frames` and send it on the other port; a loop may do that in its stead, without making a Frame.
+    it in `frames` and send it on the other port; a loop may do that in its stead, without making a Frame. A frame may
+    make it PASS_ON for others, but TAKE only for those that come later than a loop's next look at the buses.
     """
 
     def __init__(self) -> None:

@@ -323,9 +323,7 @@ def test_run_until_is_inclusive_for_frames(until: int, served: int) -> None:
 
 
 @given(sends=SENDS, stops=st.lists(st.integers(0, 3_000_000), max_size=10))
-def test_stopping_in_between_changes_nothing(
-    sends: list[tuple[int, int, int, bytes]], stops: list[int]
-) -> None:
+def test_stopping_in_between_changes_nothing(sends: list[tuple[int, int, int, bytes]], stops: list[int]) -> None:
     """Many calls of `run_until` give the trace of one."""
 
     def run(times: list[int]) -> str:
