@@ -15,6 +15,7 @@ import numpy as np
 from canopen_exo.bus.frame import FLAG_ERROR
 from canopen_exo.bus.medium import Medium
 from canopen_exo.bus.node import MS, NEVER, SECOND
+from canopen_exo.bus.wire import Wire
 from fi_gateway.injector import Injector
 from fi_gateway.replay import Window
 from fi_gateway.schema import build_injectors
@@ -176,14 +177,22 @@ def record_of(rig: Rig) -> RunRecord:
 
 
 def _stats(rig: Rig, medium: Medium) -> BusStats:
-    """Frames that ended within the motion, and the share of it that they lasted (error frames not counted)."""
+    """Frames that ended within the motion, and the share of it in which the bus was busy with them or with errors.
+
+    Of disturbed attempts it is their whole span that counts, with error frames and what they broke off.
+    """
     start = rig.controller.time_zero
     end = start + rig.params.duration_ns
-    frames, busy_ns = 0, 0
+    spans = medium.wire.spans if isinstance(medium.wire, Wire) else []
+    busy_ns = sum(last - first for first, last in spans if start < last <= end)
+    frames, at = 0, 0
     for row in rig.loop.trace:
         if row.bus == medium.index and start < row.end_ns <= end and not row.frame.flags & FLAG_ERROR:
             frames += 1
-            busy_ns += row.frame.bits * medium.bit_ns
+            while at < len(spans) and spans[at][1] < row.end_ns:
+                at += 1
+            if at == len(spans) or row.end_ns <= spans[at][0]:
+                busy_ns += row.frame.bits * medium.bit_ns
     return BusStats(medium.name, frames, busy_ns / (end - start), sum(port.dropped for port in medium.ports))
 
 
