@@ -92,6 +92,9 @@ class Target:
         self.name: Final[str] = name
         self.on_bus: Final[bool] = on_bus
 
+    def __deepcopy__(self, memo: dict[int, object]) -> "Target":
+        return self  # it never changes: copies share it
+
     def __reduce__(self) -> tuple[type["Target"], tuple[bool, bool, tuple[int, ...], str, bool]]:
         return Target, (self.to_controller, self.to_drives, self.cob_ids, self.name, self.on_bus)
 
