@@ -177,7 +177,7 @@ def piece_figures(repeat: int) -> Figures:
 
 
 def engine_figures(frame: Frame, plan: BusPlan, repeat: int) -> Figures:
-    """A frame through a gateway with injectors [us]: no target of theirs, one that waits, a bias, a flip, a chain of four.
+    """A frame through a gateway with injectors [us]: not their target, one that waits, a bias, a flip, a chain of four.
 
     Of the chain each link starts the next one with the same frame and has a window of one frame, so that each frame
     opens, acts on and closes four windows.

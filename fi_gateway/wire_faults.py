@@ -223,7 +223,7 @@ class Noise(WireFault):
         """The bits that are hit."""
         if not self.meets(now, until, frame):
             return []
-        while self._known_ns < until:
+        while self._known_ns < min(until, self.until):  # nothing is drawn for after the window
             self._draw()
         flips = self._flips
         while flips and flips[0] < now:
