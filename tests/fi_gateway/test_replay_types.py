@@ -29,8 +29,10 @@ def windows_of(bench: Bench) -> dict[str, tuple[Window, ...]]:
 @pytest.mark.parametrize(("target", "fault"), FAULT_TEXTS)
 @settings(max_examples=4, deadline=None)
 @given(event=st.sampled_from(EVENT_TEXTS), effect=st.sampled_from(EFFECT_TEXTS), seed=st.integers(0, 1000))
-def test_a_replay_of_any_fault_gives_the_same_trace(target: str, fault: str, event: str, effect: str, seed: int) -> None:
-    """results.md: the frames are the same again, also with errors on the buses, whatever event and effect there were."""
+def test_a_replay_of_any_fault_gives_the_same_trace(
+    target: str, fault: str, event: str, effect: str, seed: int
+) -> None:
+    """results.md: the frames are the same again, also with errors on the buses, whatever started and ended windows."""
     text = text_of(target, fault, event, effect)
     first = ran(Bench(text, seed))
     again = ran(Bench(text, seed, windows_of(first)))

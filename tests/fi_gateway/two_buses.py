@@ -1,4 +1,4 @@
-"""Two buses with controller, gateway and six drives, without plant and control law; and every type of injector in text."""
+"""Two buses with controller, gateway and six drives, without plant and control law; every type of injector in text."""
 
 import random
 import struct
