@@ -81,7 +81,7 @@ class Disturbance:
         return []
 
     def disturbed(self, now: int, frame: Frame | None) -> None:
-        """Somebody noticed an error in an attempt to send `frame` in which it had disrupted bits (None: an idle bus).
+        """Somebody noticed an error in an attempt to send `frame` after it had disrupted bits (None: an idle bus).
 
         Said once an attempt, when the first error is noticed, or a frame accepted that is not the one sent.
         """

@@ -69,7 +69,7 @@ class Wire(Wiring):
         self._unsettled: list[Controller] = []
         self._free_ns: int = 0
         self._states: ErrorStates = ErrorStates(medium)
-        self._suspects: list[Disturbance] = []
+        self._suspects: list[tuple[Disturbance, int]] = []
         self._sent: Frame | None = None
         self._is_noticed: bool = False
         self._is_charged: bool = False
@@ -119,14 +119,14 @@ class Wire(Wiring):
         self._started_ns = now
 
     def _ask(self, now: int, until: int, frame: Frame | None, sender: int) -> list[Disruption]:
-        """What disturbs the next attempt; who does is noted."""
+        """What disturbs the next attempt; who does is noted, and from which bit on."""
         disruptions: list[Disruption] = []
         self._suspects = []
         for disturbance in self.disturbances:
             found = disturbance.errors(now, until, self.medium.bit_ns, frame, sender)
             if found:
                 disruptions.extend(found)
-                self._suspects.append(disturbance)
+                self._suspects.append((disturbance, min([one.first for one in found])))
         return disruptions
 
     def _is_contested(self, first: tuple[Frame, Port]) -> bool:
@@ -213,13 +213,13 @@ class Wire(Wiring):
         frame, port = medium.on_wire
         if medium.end == NEVER or (is_plain and not is_present(port)):
             return
-        suspects = self._suspects
+        known = self._suspects
         until = max(self._started_ns + frame.bits * medium.bit_ns, now) + MARGIN * medium.bit_ns
         if is_plain or self._sent is not None:
             found = self._ask(self._started_ns, until, frame, port.number)
         else:
             found = self._ask(self._started_ns, until, None, -1)
-        self._suspects.extend(one for one in suspects if one not in self._suspects)
+        self._suspects = known + [one for one in self._suspects if one not in known]
         before = [] if is_plain else self._disruptions
         found = joined(before, found, (now - self._started_ns) // medium.bit_ns)
         if found == before:
@@ -273,8 +273,11 @@ class Wire(Wiring):
         suspects, self._suspects = self._suspects, []
         if not self._is_noticed:
             self._is_noticed = True
-            for disturbance in suspects:
-                disturbance.disturbed(now, self._sent)
+            told: list[Disturbance] = []
+            for disturbance, first in suspects:
+                if self._started_ns + first * self.medium.bit_ns < now and disturbance not in told:
+                    told.append(disturbance)
+                    disturbance.disturbed(now, self._sent)
 
     def _passed(self, now: int, events: list[WireEvent]) -> None:
         """A frame has passed undisturbed: the counters fall."""
