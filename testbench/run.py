@@ -6,14 +6,14 @@ them comes from the faults.
 
 import gc
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
 from canopen_exo.bus.frame import FLAG_ERROR
-from canopen_exo.bus.medium import Medium
+from canopen_exo.bus.medium import Medium, Transmission
 from canopen_exo.bus.node import MS, NEVER, SECOND
 from canopen_exo.bus.wire import Wire
 from fi_gateway.injector import Injector
@@ -177,23 +177,28 @@ def record_of(rig: Rig) -> RunRecord:
 
 
 def _stats(rig: Rig, medium: Medium) -> BusStats:
-    """Frames that ended within the motion, and the share of it in which the bus was busy with them or with errors.
-
-    Of disturbed attempts it is their whole span that counts, with error frames and what they broke off.
-    """
     start = rig.controller.time_zero
     end = start + rig.params.duration_ns
+    frames, busy_ns = traffic(rig.loop.trace, medium, start, end)
+    return BusStats(medium.name, frames, busy_ns / (end - start), sum(port.dropped for port in medium.ports))
+
+
+def traffic(rows: Sequence[Transmission], medium: Medium, start: int, end: int) -> tuple[int, int]:
+    """Frames that ended within (start, end], and the time in which the bus was busy with them or with errors [ns].
+
+    Of a disturbed attempt to send it is the whole span that counts, with error frames and what they broke off.
+    """
     spans = medium.wire.spans if isinstance(medium.wire, Wire) else []
     busy_ns = sum(last - first for first, last in spans if start < last <= end)
     frames, at = 0, 0
-    for row in rig.loop.trace:
+    for row in rows:
         if row.bus == medium.index and start < row.end_ns <= end and not row.frame.flags & FLAG_ERROR:
             frames += 1
             while at < len(spans) and spans[at][1] < row.end_ns:
                 at += 1
             if at == len(spans) or row.end_ns <= spans[at][0]:
                 busy_ns += row.frame.bits * medium.bit_ns
-    return BusStats(medium.name, frames, busy_ns / (end - start), sum(port.dropped for port in medium.ports))
+    return frames, busy_ns
 
 
 def _invalid_reasons(rig: Rig) -> list[str]:
