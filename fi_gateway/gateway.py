@@ -29,9 +29,10 @@ from mypy_extensions import mypyc_attr
 
 from canopen_exo.bus.frame import Frame
 from canopen_exo.bus.medium import Medium
-from canopen_exo.bus.node import MS, NEVER, ErrorState, Out, PortState, Relay
+from canopen_exo.bus.node import MS, NEVER, PASS_ON, TAKE, ErrorState, Out, PortState, Relay
 from canopen_exo.bus.wire import Wire
 from canopen_exo.plan import STATUS_MOTION, STATUS_STOPPED
+from canopen_exo.sync import SyncCadence
 from fi_gateway.activation import Activation
 from fi_gateway.errors import FaultError
 from fi_gateway.injector import Injector
@@ -44,18 +45,19 @@ DRIVE_PORT: Final = 1
 
 _STATE: Final = (
     "wake_at",
+    "filters",
     "frames",
     "undelivered",
     "notices",
     "port_changes",
     "malformed",
     "time_zero",
-    "_last_sync",
+    "cadence",
     "_power_up",
     "_states",
     "_away",
     "_probe_at",
-    "is_disturbed",
+    "_is_disturbed",
     "_media",
 )
 """What `__reduce__` copies besides the constructor arguments; the routes are laid afresh, and what is attached stays
@@ -124,7 +126,8 @@ class Gateway(Relay):
     original.
     frames, lost, inserted, undelivered: received, lost and added by faults, and not offered because the other port is
     away, by the port they came in on; waiting: frames that go on later; notices: error notices by port; port_changes:
-    those that changed a port's state; malformed: status frames too short to read. time_zero: ns, NEVER until known.
+    those that changed a port's state; malformed: status frames too short to read. time_zero: ns, NEVER until known;
+    cadence: of SYNC from the controller.
 
     Eleven public methods: four are a Node's life and its end, five are live control's, two are for wire faults.
     """
@@ -139,13 +142,14 @@ class Gateway(Relay):
         self.port_changes: list[PortChange] = []
         self.malformed: int = 0
         self.time_zero: int = NEVER
+        self.cadence: SyncCadence = SyncCadence(cycle_ns)
         self._cycle_ns: Final[int] = cycle_ns
-        self._last_sync: int = -NEVER
         self._power_up: int = 0
         self._commands: CommandPort | None = None
         self._states: list[ErrorState] = [ErrorState.ERROR_ACTIVE, ErrorState.ERROR_ACTIVE]
         self._away: list[bool] = [False, False]
         self._probe_at: list[int] = [0, 0]
+        self._is_disturbed: bool = False
         self._passage: Final[Passage] = passage if passage is not None else Passage(self.injectors)
         self._from_controller: Final[list[Route | None]] = self._passage.from_controller
         self._from_drives: Final[list[Route | None]] = self._passage.from_drives
@@ -191,7 +195,7 @@ class Gateway(Relay):
                 if left is None:
                     return
                 frame = left
-        if self.is_disturbed:
+        if self._is_disturbed:
             self._came_in(now, port)
             if not self._can_send(now, 1 - port):
                 self.undelivered[port] += 1
@@ -294,10 +298,11 @@ class Gateway(Relay):
         return Gateway, (self.injectors, self._cycle_ns, self._passage), state
 
     def _note_passes(self) -> None:
-        """Say which frames need nothing from here."""
+        """Say which frames need nothing from here: none while a port is away."""
         for port, table in ((CONTROLLER_PORT, self._from_controller), (DRIVE_PORT, self._from_drives)):
+            filters = self.filters[port]
             for cob_id, route in enumerate(table):
-                self.passes[port][cob_id] = 1 if route is None else 0
+                filters[cob_id] = PASS_ON if route is None and not self._is_disturbed else TAKE
 
     def _power_on(self, now: int) -> None:
         """The first frame: start the injectors that count from here."""
@@ -333,7 +338,7 @@ class Gateway(Relay):
     def _observe(self, now: int, kind: int, frame: Frame) -> None:
         """Look for time 0 in SYNC and status frames from the controller, then for the end of the motion."""
         if kind == SYNC_READ:
-            self._last_sync = now
+            self.cadence.received(now)
         elif len(frame.data) < 3:
             self.malformed += 1
         elif self.time_zero != NEVER:
@@ -343,9 +348,9 @@ class Gateway(Relay):
                     if not injector.from_power_up:
                         injector.stop(now)
                 self._passage.settle(now)
-        elif frame.data[0] == STATUS_MOTION and now - self._last_sync < self._cycle_ns:
+        elif frame.data[0] == STATUS_MOTION and now - self.cadence.last < self._cycle_ns:
             cycle = frame.data[1] | frame.data[2] << 8
-            self.begin(self._last_sync - cycle * self._cycle_ns)
+            self.begin(self.cadence.last - cycle * self._cycle_ns)
             self._passage.settle(now)
 
     def _arrange(self, now: int) -> None:
@@ -380,7 +385,7 @@ class Gateway(Relay):
         if passage.outbox:
             outbox, passage.outbox = passage.outbox, []
             for port, frame in outbox:
-                if self.is_disturbed and not self._can_send(now, port):
+                if self._is_disturbed and not self._can_send(now, port):
                     self.undelivered[1 - port] += 1
                 else:
                     out.send(port, frame)
@@ -393,7 +398,9 @@ class Gateway(Relay):
         self.port_changes.append(PortChange(now, port, state, cause))
         self._away[port] = state is ErrorState.BUS_OFF or state is ErrorState.DOWN
         self._probe_at[port] = now + _PROBE_NS
-        self.is_disturbed = self._away[0] or self._away[1]
+        if self._is_disturbed is not (self._away[0] or self._away[1]):
+            self._is_disturbed = not self._is_disturbed
+            self._note_passes()
 
     def _came_in(self, now: int, port: int) -> None:
         """A frame has come in: the port is there."""

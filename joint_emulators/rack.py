@@ -8,7 +8,7 @@ SYNC latches the last finished step.
 from typing import Final, final
 
 from canopen_exo.bus.frame import Frame
-from canopen_exo.bus.node import Node, Out, PortState
+from canopen_exo.bus.node import IGNORE, TAKE, Node, Out, PortState
 from canopen_exo.device import Device
 from canopen_exo.plan import SYNC
 from joint_emulators.drive import Drive
@@ -42,6 +42,8 @@ class Rack(Node):
         self.wake_at = 0
         self._hearing: list[list[Device]] = []
         self._revision: int = -1
+        self._filter: Final[bytearray] = bytearray(0x800)
+        self.filters = [self._filter] * len(devices)
         self._route()
         self._sense()
 
@@ -129,3 +131,5 @@ class Rack(Node):
         for device in self.devices:
             for can_id in set(device.cob_ids()):
                 self._hearing[can_id].append(device)
+        for can_id, hearing in enumerate(self._hearing):
+            self._filter[can_id] = TAKE if hearing else IGNORE

@@ -6,7 +6,9 @@ them comes from the faults.
 
 import gc
 import time
-from collections.abc import Callable, Mapping, Sequence
+from bisect import bisect_right
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Final
 
@@ -21,11 +23,12 @@ from fi_gateway.replay import Window
 from fi_gateway.schema import build_injectors
 from hlc.limits import limits_of
 from hlc.node import HighLevelController, Phase
+from testbench.document import Summary
 from testbench.errors import BenchError
 from testbench.record import BusStats, Commands, RigEvent, RunRecord, Truth
 from testbench.rig import Rig, RigParams, build_rig
 from testbench.scenario import Scenario
-from testbench.summary import Summary, summary_document
+from testbench.summary import summary_document
 from testbench.verdict import Judgement, judge
 
 CHUNK_NS: Final = 50 * MS
@@ -70,8 +73,31 @@ def run_scenario(
     golden, golden_ns = run_rig(params, [], lambda share: progress(0.5 * share))
     injectors = build_injectors(scenario.injectors, params.plan, scenario.seed, 0, recorded)
     faulted, faulted_ns = run_rig(params, injectors, lambda share: progress(0.5 + 0.5 * share))
-    names = tuple(joint.name for joint in params.plan.joints)
-    judgement = judge(
+    wall_time_s = time.perf_counter() - started
+    return result_of(scenario, golden, faulted, sim_time_s=(golden_ns + faulted_ns) / 1e9, wall_time_s=wall_time_s)
+
+
+def result_of(
+    scenario: Scenario, golden: RunRecord, faulted: RunRecord, *, sim_time_s: float, wall_time_s: float
+) -> Result:
+    """The pair of runs judged, and what is said about it. sim_time_s, wall_time_s: of the runs made for it."""
+    judgement = judge_pair(scenario, golden, faulted)
+    document = summary_document(
+        scenario.name,
+        scenario.seed,
+        golden,
+        faulted,
+        judgement,
+        sim_time_s=sim_time_s,
+        wall_time_s=wall_time_s,
+    )
+    return Result(scenario, golden, faulted, judgement, document)
+
+
+def judge_pair(scenario: Scenario, golden: RunRecord, faulted: RunRecord) -> Judgement:
+    """As the scenario wants it judged, by the table's limits of its joints."""
+    names = tuple(joint.name for joint in scenario.plan.joints)
+    return judge(
         names,
         {name: limits_of(name) for name in names},
         golden,
@@ -80,16 +106,6 @@ def run_scenario(
         fail_on=scenario.fail_on,
         expectations=scenario.expect,
     )
-    document = summary_document(
-        scenario.name,
-        scenario.seed,
-        golden,
-        faulted,
-        judgement,
-        sim_time_s=(golden_ns + faulted_ns) / 1e9,
-        wall_time_s=time.perf_counter() - started,
-    )
-    return Result(scenario, golden, faulted, judgement, document)
 
 
 def rig_params(scenario: Scenario) -> RigParams:
@@ -102,27 +118,44 @@ def run_rig(
 ) -> tuple[RunRecord, int]:
     """One run from power-up to disabled drives; the record and the time simulated [ns]. Raises NotStartedError."""
     rig = build_rig(params, injectors)
-    collecting = gc.isenabled()
-    gc.disable()  # nothing in a run makes cycles of references; looking for them costs a fifth of the time
-    try:
+    with uncollected():
         drive_through(rig, progress)
-    finally:
-        if collecting:
-            gc.enable()
-    return record_of(rig), rig.loop.now
+        return record_of(rig), rig.loop.now
 
 
 def drive_through(rig: Rig, progress: Progress) -> None:
     """Run the loop until the motion time is over and the drives are left; always ends."""
+    usual_ns = rig.params.stride_ns + rig.params.duration_ns + LEAVE_NS
+    for now in chunks(rig):
+        progress(min(1.0, now / usual_ns))
+    rig.gateway.finish(rig.loop.now)
+    progress(1.0)
+
+
+@contextmanager
+def uncollected() -> Iterator[None]:
+    """No garbage collection: nothing in a run makes cycles of references, and looking costs a fifth of the time."""
+    collecting = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if collecting:
+            gc.enable()
+
+
+def chunks(rig: Rig, step_ns: int = CHUNK_NS) -> Iterator[int]:
+    """Run the loop until the motion time is over and the drives are left; always ends, on a multiple of CHUNK_NS.
+
+    Pauses every step_ns, of which CHUNK_NS is a multiple, and yields the loop's time.
+    """
     controller, loop, params = rig.controller, rig.loop, rig.params
     latest = START_NS + params.stride_ns + params.duration_ns + LEAVE_NS
     while loop.now < latest:
-        loop.run_until(loop.now + CHUNK_NS)
-        if motion_over(controller, params.duration_ns, loop.now):
-            break
-        progress(min(1.0, loop.now / (latest - START_NS)))
-    rig.gateway.finish(loop.now)
-    progress(1.0)
+        loop.run_until(loop.now + step_ns)
+        if loop.now % CHUNK_NS == 0 and motion_over(controller, params.duration_ns, loop.now):
+            return
+        yield loop.now
 
 
 def motion_over(controller: HighLevelController, duration_ns: int, now: int) -> bool:
@@ -156,16 +189,16 @@ def record_of(rig: Rig) -> RunRecord:
         np.array([sample.dq_d for sample in samples]),
         np.array([sample.tau_command for sample in samples]),
     )
-    media = (rig.controller_bus, rig.drive_bus)
+    trace = rig.loop.trace
     return RunRecord(
-        rows=rig.loop.trace,
+        rows=trace,
         time0_ns=rig.gateway.time_zero,
         duration_ns=params.duration_ns,
         truth=truth,
         commands=commands,
         activations=[one for one in rig.gateway.records if one.start_ns < end],
         activations_after=[one for one in rig.gateway.records if one.start_ns >= end],
-        buses=tuple(_stats(rig, medium) for medium in media),
+        buses=_stats(rig, trace),
         notes=[
             RigEvent((event.time_ns - zero) / 1e9, event.joint or "HLC", event.kind, event.text)
             for event in controller.events
@@ -176,29 +209,38 @@ def record_of(rig: Rig) -> RunRecord:
     )
 
 
-def _stats(rig: Rig, medium: Medium) -> BusStats:
+def _stats(rig: Rig, rows: list[Transmission]) -> tuple[BusStats, ...]:
+    """Of each bus, what passed within the motion, and the share of it in which the bus was busy."""
+    media = (rig.controller_bus, rig.drive_bus)
     start = rig.controller.time_zero
     end = start + rig.params.duration_ns
-    frames, busy_ns = traffic(rig.loop.trace, medium, start, end)
-    return BusStats(medium.name, frames, busy_ns / (end - start), sum(port.dropped for port in medium.ports))
+    return tuple(
+        BusStats(medium.name, frames, busy_ns / (end - start), sum(port.dropped for port in medium.ports))
+        for medium, (frames, busy_ns) in zip(media, traffic(rows, media, start, end), strict=True)
+    )
 
 
-def traffic(rows: Sequence[Transmission], medium: Medium, start: int, end: int) -> tuple[int, int]:
-    """Frames that ended within (start, end], and the time in which the bus was busy with them or with errors [ns].
+def traffic(rows: list[Transmission], media: Sequence[Medium], start: int, end: int) -> list[tuple[int, int]]:
+    """Of each bus, frames that ended within (start, end], and the time for which it was busy with them or with errors.
 
-    Of a disturbed attempt to send it is the whole span that counts, with error frames and what they broke off.
+    [ns]. Of a disturbed attempt to send it is the whole span that counts, with error frames and what they broke off.
+    media: by their index.
     """
-    spans = medium.wire.spans if isinstance(medium.wire, Wire) else []
-    busy_ns = sum(last - first for first, last in spans if start < last <= end)
-    frames, at = 0, 0
-    for row in rows:
-        if row.bus == medium.index and start < row.end_ns <= end and not row.frame.flags & FLAG_ERROR:
-            frames += 1
-            while at < len(spans) and spans[at][1] < row.end_ns:
-                at += 1
-            if at == len(spans) or row.end_ns <= spans[at][0]:
-                busy_ns += row.frame.bits * medium.bit_ns
-    return frames, busy_ns
+    spans = [medium.wire.spans if isinstance(medium.wire, Wire) else [] for medium in media]
+    busy_ns = [sum(last - first for first, last in each if start < last <= end) for each in spans]
+    frames, at = [0] * len(media), [0] * len(media)
+    begin = bisect_right(rows, start, key=lambda row: row.end_ns)
+    for place in range(begin, bisect_right(rows, end, key=lambda row: row.end_ns)):
+        row = rows[place]
+        bus, each = row.bus, spans[row.bus]
+        if row.frame.flags & FLAG_ERROR:
+            continue
+        frames[bus] += 1
+        while at[bus] < len(each) and each[at[bus]][1] < row.end_ns:
+            at[bus] += 1
+        if at[bus] == len(each) or row.end_ns <= each[at[bus]][0]:
+            busy_ns[bus] += row.frame.bits * media[bus].bit_ns
+    return list(zip(frames, busy_ns, strict=True))
 
 
 def _invalid_reasons(rig: Rig) -> list[str]:

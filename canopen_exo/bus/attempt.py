@@ -8,7 +8,7 @@ from typing import Final, final
 
 from canopen_exo.bus.controller import ACCEPT_TO_END, Controller, Detected
 from canopen_exo.bus.frame import Frame
-from canopen_exo.bus.medium import Medium, Port
+from canopen_exo.bus.medium import Port
 from canopen_exo.bus.recovery import is_present
 
 COUNT: Final = 0
@@ -46,15 +46,12 @@ class Step:
         return Step, (self.at, self.kind, self.port, self.tec, self.rec, self.frame, self.ports, self.error)
 
 
-def put_back(medium: Medium, frame: Frame, port: Port) -> None:
-    """A frame under way that was taken for undisturbed, back into its queue: before those of its id."""
-    waiting = medium.waiting
+def put_back(waiting: list[tuple[Frame, Port]], frame: Frame, port: Port) -> None:
+    """A frame under way that was taken for undisturbed, back among those that wait: before those of its id."""
     at = 0
     while at < len(waiting) and waiting[at][0].arbitration < frame.arbitration:
         at += 1
     waiting.insert(at, (frame, port))
-    medium.frames -= 1
-    medium.busy_ns -= frame.bits * medium.bit_ns
 
 
 def controllers_of(

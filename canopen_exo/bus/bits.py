@@ -130,17 +130,27 @@ _HEADS: Final = [[_head(can_id, size) for can_id in range(0x800)] if size % 2 ==
 def base_frame_bits(can_id: int, data: bytes) -> int:
     """Bits on the wire of a base data frame, from SOF to the end of the 3-bit intermission, stuff bits included."""
     size = len(data)
-    if size & 1:
-        return frame_bits(can_id, data, False, False, size)
-    row, crc, bits = _HEADS[size][can_id]
-    crcs, counts, following = _CRC, _COUNT, _NEXT
-    word: int
-    for word in _WORDS[size](data):
-        entry = row[word]
-        bits += counts[entry]
-        row = following[entry]
-        crc = crcs[crc ^ word]
-    return bits + _LAST_COUNT[row[crc]]
+    first: int
+    second: int
+    third: int
+    fourth: int
+    if size == 8:  # nearly all frames have 8 or 4 bytes: written out, without a loop
+        row, crc, bits = _HEADS[8][can_id]
+        first, second, third, fourth = _WORDS[8](data)
+        following, counts, crcs = _NEXT, _COUNT, _CRC
+        one = row[first]
+        two = following[one][second]
+        three = following[two][third]
+        four = following[three][fourth]
+        crc = crcs[crcs[crcs[crcs[crc ^ first] ^ second] ^ third] ^ fourth]
+        return bits + counts[one] + counts[two] + counts[three] + counts[four] + _LAST_COUNT[following[four][crc]]
+    if size == 4:
+        row, crc, bits = _HEADS[4][can_id]
+        first, second = _WORDS[4](data)
+        one = row[first]
+        two = _NEXT[one][second]
+        return bits + _COUNT[one] + _COUNT[two] + _LAST_COUNT[_NEXT[two][_CRC[_CRC[crc ^ first] ^ second]]]
+    return frame_bits(can_id, data, False, False, size)
 
 
 def frame_bits(can_id: int, data: bytes, extended: bool, remote: bool, dlc: int) -> int:

@@ -58,10 +58,10 @@ class Frame:
     def measure(self) -> int:
         """Work out `bits`; once is enough, both hops of a gateway use it."""
         flags = self.flags
-        if flags == 0 and self.dlc == len(self.data):
-            bits = base_frame_bits(self.can_id, self.data)
-        else:
+        if flags or self.dlc > 8:
             bits = frame_bits(self.can_id, self.data, flags & FLAG_EXTENDED != 0, flags & FLAG_REMOTE != 0, self.dlc)
+        else:
+            bits = base_frame_bits(self.can_id, self.data)
         self.bits = bits
         return bits
 
@@ -82,7 +82,8 @@ class Frame:
         return hash((self.can_id, self.data, self.flags, self.dlc))
 
     def __deepcopy__(self, memo: dict[int, object]) -> "Frame":
-        return self  # it never changes: copies share it
+        """Itself: it never changes."""
+        return self
 
     def __reduce__(self) -> tuple[type["Frame"], tuple[int, bytes, int, int]]:
         return Frame, (self.can_id, self.data, self.flags, self.dlc)

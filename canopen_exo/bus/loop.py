@@ -4,11 +4,12 @@ At each instant: frames that end (by bus; each bus ends at most one), then nodes
 buses arbitrate. No clock is read: the same nodes give the same trace on every machine.
 """
 
+import copy
 from typing import Final, final
 
 from canopen_exo.bus.frame import Frame
-from canopen_exo.bus.medium import QUEUE_LENGTH, Medium, Port, Transmission, WireEvent, WireSink, Wiring
-from canopen_exo.bus.node import NEVER, ErrorState, Node, Out, PortState
+from canopen_exo.bus.medium import QUEUE_LENGTH, Listener, Medium, Port, Transmission, WireEvent, WireSink, Wiring
+from canopen_exo.bus.node import NEVER, PASS_ON, SECOND, ErrorState, Node, Out, PortState, Relay
 from canopen_exo.errors import CanopenExoError
 
 
@@ -43,15 +44,43 @@ class Loop:
         self._ends: Final[list[int]] = []
         self._passed: Final[list[tuple[Frame, Port]]] = []
         self._rows: Final[list[Transmission]] = []
+        self._recalled: int = 0
+        self._nowhere: Final[Medium] = Medium("none", -1, SECOND)
 
     @property
     def trace(self) -> list[Transmission]:
         """Every frame that passed a bus so far, in loop order."""
         rows = self._rows
-        for at in range(len(rows), len(self._ends)):
+        for at in range(len(rows) - self._recalled, len(self._ends)):
             frame, sender = self._passed[at]
             rows.append(Transmission(self._ends[at], sender.medium.index, frame, sender.number))
         return rows
+
+    def forget(self) -> None:
+        """Leave the trace so far to somebody else who has it, and may give it back (`resume`)."""
+        self._rows.clear()
+        self._ends.clear()
+        self._passed.clear()
+        self._recalled = 0
+
+    def resume(self, rows: list[Transmission]) -> None:
+        """Of a copy that has forgotten: the trace so far. Nodes that have taken another one's place are heard."""
+        self._rows.extend(rows)
+        self._recalled = len(rows)
+        for medium in self.media:
+            self._listen(medium)
+
+    def __deepcopy__(self, memo: dict[int, object]) -> "Loop":
+        """The same state between two instants; the rows of the trace are shared."""
+        twin = Loop([])
+        memo[id(self)] = twin  # first: a Wire on a medium leads back here
+        twin.media.extend(copy.deepcopy(self.media, memo))
+        twin.nodes = copy.deepcopy(self.nodes, memo)
+        twin.outs = copy.deepcopy(self.outs, memo)
+        twin.now = self.now
+        twin._rows.extend(self.trace)
+        twin._recalled = len(twin._rows)
+        return twin
 
     def connect(self, node: Node, media: list[Medium]) -> None:
         """Add a node; its port k is attached to media[k]. Order of adding is the order of waking."""
@@ -66,7 +95,7 @@ class Loop:
     def _listen(self, medium: Medium) -> None:
         """Who hears each sender: every node once, on the first of its ports there that is neither it nor bus-off."""
         for sender in medium.ports:
-            listeners: list[tuple[Node, int, Out]] = []
+            listeners: list[Listener] = []
             for node, out in zip(self.nodes, self.outs, strict=True):
                 hearing: list[int] = []
                 deaf = False
@@ -76,8 +105,11 @@ class Loop:
                             deaf = True
                         else:
                             hearing.append(port)
-                if hearing:
-                    listeners.append((_Part(node, hearing) if deaf else node, hearing[0], out))
+                if hearing and deaf:
+                    listeners.append(Listener(_Part(node, hearing), hearing[0], out, sender))
+                elif hearing:
+                    onward = out.ports[1 - hearing[0]] if isinstance(node, Relay) else sender
+                    listeners.append(Listener(node, hearing[0], out, onward))
             sender.listeners = listeners
 
     def install(self, wire: Wiring, medium: Medium) -> None:
@@ -91,53 +123,99 @@ class Loop:
         """Serve every instant up to and including `until` [ns]."""
         if until < self.now:
             raise CanopenExoError(f"loop: run until {until} ns given, it is {self.now} ns; time does not go back")
-        media = self.media
-        ends, passed = self._ends, self._passed
-        for medium in media:  # queued between two calls, or the cable was mended
-            if (medium.waiting or medium.is_restless) and medium.end == NEVER:
-                medium.arbitrate(self.now)
+        now = self.now
         wake = self._first_wake()
-        if wake < self.now:
-            raise CanopenExoError(
-                f"loop: a node asks to be woken at {wake} ns, it is {self.now} ns; wake_at must move on"
-            )
-        end = self._first_end()
+        if wake < now:
+            raise CanopenExoError(f"loop: a node asks to be woken at {wake} ns, it is {now} ns; wake_at must move on")
+        media, ends, passed = self.media, self._ends, self._passed
+        first = self._nowhere
         while True:
-            now = wake if wake < end else end
-            if now > until:
-                self.now = until
-                return
-            if end == now:
-                for medium in media:
-                    if medium.end == now:
-                        medium.end = NEVER
-                        if medium.is_watched:
-                            wire = medium.wire
-                            if wire is not None:
-                                wire.advance(now)
+            # idle buses arbitrate (at first: what was queued between two calls); then it shows which frame ends first
+            end = NEVER
+            is_alone = True
+            for medium in media:
+                at = medium.end
+                if at == NEVER:
+                    waiting = medium.waiting
+                    if medium.is_special:
+                        if waiting or medium.is_restless:
+                            medium.arbitrate(now)
                             wake = self._first_wake()
+                        at = medium.end
+                        if at == NEVER:
                             continue
-                        row = medium.on_wire
-                        ends.append(now)
-                        passed.append(row)
-                        frame, sender = row
-                        for node, port, out in sender.listeners:
-                            node.receive(now, port, frame, out)
+                    elif waiting:  # as Medium.arbitrate, without the call
+                        medium.on_wire = row = waiting.pop(0)
+                        frame = row[0]
+                        medium.end = at = now + (frame.bits or frame.measure()) * medium.bit_ns
+                    else:
+                        continue
+                if at < end:
+                    end = at
+                    first = medium
+                    is_alone = True
+                elif at == end:
+                    is_alone = False
+            # the next instant: frames before wake-ups
+            if end <= wake:
+                if end > until:
+                    break
+                now = end
+                first.end = NEVER
+                row = first.on_wire
+                frame, sender = row
+                if first.is_watched or frame.flags:
+                    self._end(now, first)
+                    wake = self._first_wake()
+                else:
+                    ends.append(now)
+                    passed.append(row)
+                    can_id = frame.can_id
+                    for listener in sender.listeners:
+                        action = listener.filter[can_id]
+                        if action == PASS_ON:
+                            listener.counts[listener.port] += 1
+                            onward = listener.onward
+                            waiting = onward.waiting
+                            if waiting:
+                                listener.out.send(1 - listener.port, frame)
+                            else:
+                                waiting.append((frame, onward))
+                        elif action:
+                            node = listener.node
+                            node.receive(now, listener.port, frame, listener.out)
                             if node.wake_at < wake:
                                 wake = node.wake_at
-            if wake <= now:
+                if not is_alone:
+                    for medium in media:
+                        if medium.end == now:
+                            medium.end = NEVER
+                            self._end(now, medium)
+                    wake = self._first_wake()
+                if wake <= now:
+                    wake = self._wake(now)
+            elif wake > until:
+                break
+            else:
+                now = wake
                 wake = self._wake(now)
-            end = NEVER
-            for medium in media:
-                if medium.end == NEVER:
-                    if not medium.waiting and not medium.is_restless:
-                        continue
-                    medium.arbitrate(now)
-                    if medium.end == NEVER:  # put off, or the cable is cut
-                        wake = self._first_wake()
-                        continue
-                if medium.end < end:
-                    end = medium.end
+        self.now = until
+
+    def _end(self, now: int, medium: Medium) -> None:
+        """The end of a frame that is watched, or of no base data frame: nothing is taken for granted."""
+        wire = medium.wire
+        if medium.is_watched and wire is not None:
+            wire.advance(now)
+            return
+        frame, sender = medium.on_wire
+        self._ends.append(now)
+        self._passed.append((frame, sender))
+        self._hear(now, frame, sender)
+
+    def _hear(self, now: int, frame: Frame, sender: Port) -> None:
+        """A frame has passed: everybody who listens takes it."""
+        for listener in sender.listeners:
+            listener.node.receive(now, listener.port, frame, listener.out)
 
     def serve(self, now: int, events: list[WireEvent]) -> None:
         """What a Wiring says has happened: rows of the trace, frames to those who accepted them, notices."""
@@ -147,8 +225,7 @@ class Loop:
             if event.state is not None:
                 self._notify(now, event.sender, event.state)
             elif event.ports is None:
-                for node, port, out in event.sender.listeners:
-                    node.receive(now, port, event.frame, out)
+                self._hear(now, event.frame, event.sender)
             elif event.ports:
                 self._deliver(now, event.frame, event.sender, event.ports)
 
@@ -177,13 +254,6 @@ class Loop:
                 if own is port:
                     notice = PortState(number, state.state, state.tec, state.rec, state.cause, state.overrun)
                     node.port_changed(now, notice, out)
-
-    def _first_end(self) -> int:
-        end = NEVER
-        for medium in self.media:
-            if medium.end < end:
-                end = medium.end
-        return end
 
     def _first_wake(self) -> int:
         wake = NEVER

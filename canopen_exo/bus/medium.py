@@ -16,7 +16,7 @@ from typing import Final, final
 from mypy_extensions import mypyc_attr
 
 from canopen_exo.bus.frame import FLAG_ERROR, FLAG_FD, Frame
-from canopen_exo.bus.node import MS, NEVER, SECOND, ErrorState, Node, Out, PortState
+from canopen_exo.bus.node import MS, NEVER, SECOND, TAKE, ErrorState, Node, Out, PortState, Relay
 from canopen_exo.errors import CanopenExoError
 
 QUEUE_LENGTH: Final = 64
@@ -27,6 +27,9 @@ RESTART_NS: Final = 100 * MS
 """From bus-off to the request to restart (assumed; a common setting of `restart-ms` of Linux)."""
 
 _NOTHING: Final = Frame(0, b"")  # on the wire of a bus that was never used
+_EVERYTHING: Final = bytearray([TAKE]) * 0x800
+_BUS_OFF: Final = ErrorState.BUS_OFF  # an enumeration is looked up slowly
+_DOWN: Final = ErrorState.DOWN
 
 
 @final
@@ -43,10 +46,28 @@ class Transmission:
 
 
 @final
+class Listener:
+    """Who hears a port: a node, on one of its own ports, with the filter there and what it answers through.
+
+    Of a Relay: counts: its `frames`; onward: the port on which it passes frames on. Not used with another node.
+    """
+
+    __slots__ = ("counts", "filter", "node", "onward", "out", "port")
+
+    def __init__(self, node: Node, port: int, out: Out, onward: "Port") -> None:
+        self.node: Final[Node] = node
+        self.port: Final[int] = port
+        self.out: Final[Out] = out
+        self.filter: Final[bytearray] = node.filters[port] if port < len(node.filters) else _EVERYTHING
+        self.counts: Final[list[int]] = node.frames if isinstance(node, Relay) else []
+        self.onward: Final[Port] = onward
+
+
+@final
 class Port:
     """One CAN controller on the medium. number: its place there; dropped: frames its full transmit queue refused.
 
-    listeners: who hears what it sends: node, the number of the port that hears it, and what the node answers through.
+    listeners: who hears what it sends.
     The rest means something with a Wiring only. tec, rec, state: fault confinement; restart_ns: from bus-off to the
     request to restart, NEVER: it stays off; is_one_shot: a disturbed frame is not sent again; lost: frames that were
     not sent because of that or of bus-off; ready_ns: it may not send before then.
@@ -61,7 +82,7 @@ class Port:
         self.medium: Final[Medium] = medium
         self.node: Final[Node] = node
         self.number: Final[int] = number
-        self.listeners: list[tuple[Node, int, Out]] = []
+        self.listeners: list[Listener] = []
         self.dropped: int = 0
         self.waiting: list[tuple[Frame, Port]] = medium.waiting
         self.tec: int = 0
@@ -138,9 +159,9 @@ class Medium:
     end: when the frame on the wire ends, NEVER while idle. on_wire: that frame and its sender, or the last ones.
     waiting: the frames of all transmit queues, each with its sender, in the order in which they will win. Each
     controller offers its lowest arbitration bits first, so one list in order of arbitration (then of arrival) holds all
-    queues. busy_ns, frames, collisions, errors: totals so far, errors being error frames.
+    queues. collisions, errors: totals so far, errors being error frames.
     wire: what can go wrong, None: nothing. is_watched: what is on the wire ends through `wire`. is_restless: a
-    controller will send an error flag though nothing waits.
+    controller will send an error flag though nothing waits. is_special: there is a wire, or the cable is cut.
     """
 
     def __init__(self, name: str, index: int, bitrate: int) -> None:
@@ -158,19 +179,17 @@ class Medium:
         self.on_wire: tuple[Frame, Port] = (_NOTHING, Port(self, Node(), -1))
         self.is_cut: bool = False
         self.cuts: int = 0
-        self.busy_ns: int = 0
-        self.frames: int = 0
         self.collisions: int = 0
         self.errors: int = 0
         self.wire: Wiring | None = None
         self.is_watched: bool = False
         self.is_restless: bool = False
-        self._is_special: bool = False
+        self.is_special: bool = False
 
     def install(self, wire: Wiring) -> None:
         """From now on errors can happen."""
         self.wire = wire
-        self._is_special = True
+        self.is_special = True
 
     def attach(self, node: Node) -> Port:
         """A new port for `node`."""
@@ -183,7 +202,7 @@ class Medium:
         if frame.flags & (FLAG_FD | FLAG_ERROR):
             kind = "CAN FD frame" if frame.flags & FLAG_FD else "error frame"
             raise CanopenExoError(f"medium {self.name!r}: {kind} {frame!r} given; this bus is classical CAN")
-        if port.state is ErrorState.BUS_OFF or port.state is ErrorState.DOWN:
+        if port.state is _BUS_OFF or port.state is _DOWN:
             port.lost += 1
             return
         waiting = self.waiting
@@ -203,23 +222,17 @@ class Medium:
 
     def arbitrate(self, now: int) -> None:
         """Start the winning frame. The bus must be idle and a frame must wait; a cut bus starts nothing."""
-        if self._is_special:
+        if self.is_special:
             if not self.is_cut and self.wire is not None:
                 self.wire.start(now)
             return
         self.on_wire = self.waiting.pop(0)
         frame = self.on_wire[0]
-        bits = frame.bits
-        if bits == 0:
-            bits = frame.measure()
-        duration = bits * self.bit_ns
-        self.frames += 1
-        self.busy_ns += duration
-        self.end = now + duration
+        self.end = now + (frame.bits or frame.measure()) * self.bit_ns
 
     def cut(self) -> None:
         """Break the cable: the frame on the wire is lost, queues fill up, nothing passes until `mend`."""
-        self.is_cut = self._is_special = True
+        self.is_cut = self.is_special = True
         self.cuts += 1
         self.end = NEVER
         self.is_watched = False
@@ -229,4 +242,4 @@ class Medium:
     def mend(self) -> None:
         """Join the cable again; queued frames compete at the next instant."""
         self.is_cut = False
-        self._is_special = self.wire is not None
+        self.is_special = self.wire is not None

@@ -58,15 +58,25 @@ class Out:
         raise NotImplementedError
 
 
+IGNORE: Final = 0
+TAKE: Final = 1
+PASS_ON: Final = 2
+"""What becomes of a base data frame at an acceptance filter (`Node.filters`)."""
+
+
 @mypyc_attr(allow_interpreted_subclasses=True)
 class Node:
     """Something on a bus: a controller, a device, a rack of devices, a gateway.
 
     wake_at: absolute time [ns] of the next call to `wake`, NEVER for none; read afresh before every wait.
+    filters: acceptance filters, as a CAN controller has them: by port and 11-bit id, IGNORE where `receive` does nothing
+    with a base data frame, so that a loop need not call it, else TAKE; none at all for a node that takes everything.
+    The node may change what stands in them at any time, but not take others.
     """
 
     def __init__(self) -> None:
         self.wake_at: int = NEVER
+        self.filters: list[bytearray] = []
 
     def receive(self, now: int, port: int, frame: Frame, out: Out) -> None:
         """A frame ended at `now` on `port`. Must not raise whatever its bytes."""
@@ -89,13 +99,11 @@ class Node:
 class Relay(Node):
     """A node with two ports, 0 and 1, that passes most frames on from one to the other, at once and unchanged.
 
-    frames: received so far, by port. passes: by port and 11-bit CAN id, 1 where all that `receive` does with a base
-    data frame is to count it in `frames` and send it on the other port; a loop may do that in its stead, without
-    making a Frame. is_disturbed: it does more at present, whatever `passes` says.
+    frames: received so far, by port. filters: PASS_ON where all that `receive` does with a base data frame is to count
+    it in `frames` and send it on the other port; a loop may do that in its stead, without making a Frame.
     """
 
     def __init__(self) -> None:
         super().__init__()
         self.frames: list[int] = [0, 0]
-        self.passes: Final[list[bytearray]] = [bytearray(0x800), bytearray(0x800)]
-        self.is_disturbed: bool = False
+        self.filters = [bytearray([TAKE]) * 0x800, bytearray([TAKE]) * 0x800]

@@ -32,7 +32,7 @@ from canopen_exo.bus.channel import Arrival, Channel, RecordArrival, RecordChann
 from canopen_exo.bus.lateness import Lateness
 from canopen_exo.bus.losses import Losses
 from canopen_exo.bus.medium import Transmission
-from canopen_exo.bus.node import MS, NEVER, SECOND, Node, PortState, Relay
+from canopen_exo.bus.node import MS, NEVER, PASS_ON, SECOND, Node, PortState, Relay
 from canopen_exo.bus.realtime_out import Line, RealTimeOut
 from canopen_exo.bus.scheduling import request_fifo, sharpen_timers
 from canopen_exo.errors import CanopenExoError
@@ -277,8 +277,7 @@ class RealTimeLoop:
         for stamp, place, can_id, record, arrival in found:
             if arrival is None:
                 if (
-                    relay.passes[place][can_id]
-                    and not relay.is_disturbed
+                    relay.filters[place][can_id] == PASS_ON
                     and relay.wake_at >= stamp
                     and self._pass_on(stamp, 1 - place, record)
                 ):

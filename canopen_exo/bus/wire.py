@@ -39,7 +39,7 @@ _LONGEST_REST: Final = 32
 
 _STATE: Final = (
     "disturbances", "sink", "wake_at", "attempts", "spans",
-    "_started_ns", "_disruptions", "_initial", "_engaged", "_steps", "_done", "_bits", "_unsettled", "_free_ns",
+    "_started_ns", "_disruptions", "_initial", "_engaged", "_steps", "_done", "_unsettled", "_free_ns",
     "_states", "_suspects", "_sent", "_is_noticed", "_is_charged", "_is_calm", "_is_stale",
 )  # fmt: skip
 """What `__reduce__` copies besides the medium, which need not be whole yet."""
@@ -65,7 +65,6 @@ class Wire(Wiring):
         self._engaged: list[Controller] = []
         self._steps: list[Step] = []
         self._done: int = 0
-        self._bits: int = 0
         self._unsettled: list[Controller] = []
         self._free_ns: int = 0
         self._states: ErrorStates = ErrorStates(medium)
@@ -112,8 +111,6 @@ class Wire(Wiring):
         else:
             waiting.remove(first)
         medium.on_wire = first
-        medium.frames += 1
-        medium.busy_ns += bits * medium.bit_ns
         medium.end = now + bits * medium.bit_ns
         medium.is_watched = self._is_charged or not self._is_calm
         self._started_ns = now
@@ -187,7 +184,7 @@ class Wire(Wiring):
         self._initial = controllers_of(offers, self._unsettled, medium.ports)
         self._sent = offers[0][0] if offers else None
         self._started_ns = now
-        self._done = self._bits = 0
+        self._done = 0
         self._is_noticed = False
         if offers:
             medium.on_wire = offers[0]
@@ -198,13 +195,10 @@ class Wire(Wiring):
 
     def _work_out(self, disruptions: list[Disruption]) -> None:
         """The attempt from its start, so disturbed; of its steps those are left that have not happened yet."""
-        medium = self.medium
         self._disruptions = disruptions
         self._engaged = split([one.part(one.ports) for one in self._initial], disruptions)
         bits = run(self._engaged, disruptions, LIMIT)
-        medium.busy_ns += (bits - self._bits) * medium.bit_ns
-        self._bits = bits
-        self._steps = steps_of(self._engaged, bits, medium.ports)[self._done :]
+        self._steps = steps_of(self._engaged, bits, self.medium.ports)[self._done :]
 
     def _work_out_again(self, now: int) -> None:
         """Something has begun or ended to disturb the bus: what is under way may go on in another way from here."""
@@ -225,7 +219,7 @@ class Wire(Wiring):
         if found == before:
             return
         if is_plain:
-            put_back(medium, frame, port)
+            put_back(medium.waiting, frame, port)
             self._attempt(self._started_ns, [(frame, port)], found)
         else:
             self._work_out(found)
@@ -253,7 +247,6 @@ class Wire(Wiring):
                 can_id, data = write_bus_error(step.error)
                 events.append(WireEvent(Frame(can_id, data, FLAG_ERROR), step.port, []))
             elif step.frame is not None:
-                medium.frames += 1
                 if step.frame != self._sent:
                     self._blame(now)
                 events.append(WireEvent(step.frame, step.port, step.ports))

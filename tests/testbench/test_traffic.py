@@ -40,7 +40,8 @@ def load_of(fault: WireFault | None) -> tuple[int, int]:
         wire = Wire(medium, [fault])
         loop.install(wire, medium)
     loop.run_until(12 * MS)
-    return traffic(loop.trace, medium, 0, 12 * MS)
+    (found,) = traffic(loop.trace, [medium], 0, 12 * MS)
+    return found
 
 
 def test_without_errors_it_is_the_length_of_the_frames() -> None:

@@ -59,7 +59,7 @@ def test_listener_sees_a_whole_run_as_the_rig_knows_it() -> None:
     assert watch.alarms == []
     assert set(watch.states.values()) == {DriveState.SWITCH_ON_DISABLED}
     # all that passed, but for what is under way, and what the boot-up messages before time 0 are
-    busy = [medium.busy_ns // medium.bit_ns for medium in (rig.controller_bus, rig.drive_bus)]
+    busy = [sum(row.frame.bits for row in rig.loop.trace if row.bus == bus) for bus in (0, 1)]
     assert watch.bits == busy
 
 

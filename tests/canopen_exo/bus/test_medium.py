@@ -48,7 +48,6 @@ def test_frame_takes_its_bits_at_the_bit_rate(bitrate: int) -> None:
     medium.queue(medium.ports[0], Frame(0x181, bytes(8)))
     medium.arbitrate(1_000)
     assert medium.end == 1_000 + (113 + 13) * (1_000_000_000 // bitrate)
-    assert (medium.busy_ns, medium.frames) == (medium.end - 1_000, 1)
 
 
 @pytest.mark.parametrize("bitrate", [0, -1, 300_000, 333_333, 2_000_000_000])
@@ -119,7 +118,6 @@ def test_all_frames_pass_once_lowest_arbitration_first(queued: list[tuple[int, F
     for end, _, frame in passed:
         now += frame.measure() * 1000
         assert end == now
-    assert (medium.busy_ns, medium.frames) == (now, len(queued))
     assert [port.queued for port in medium.ports] == [0, 0, 0, 0]
 
 
@@ -195,9 +193,8 @@ def test_queue_has_room_again_after_a_frame_started() -> None:
     medium = bus(1)
     for _ in range(200):
         medium.queue(medium.ports[0], Frame(0x100, b""))
-        medium.arbitrate(0)
-        medium.end = NEVER
-    assert (medium.ports[0].queued, medium.ports[0].dropped, medium.frames) == (0, 0, 200)
+        assert len(carried(medium)) == 1
+    assert (medium.ports[0].queued, medium.ports[0].dropped) == (0, 0)
 
 
 @pytest.mark.parametrize("size", [0, 8, 64])
@@ -219,7 +216,7 @@ def test_nothing_starts_on_a_cut_bus() -> None:
     for _ in range(65):
         medium.queue(medium.ports[0], Frame(0x100, b""))
     medium.arbitrate(0)
-    assert (medium.end, medium.frames, medium.ports[0].queued, medium.ports[0].dropped) == (NEVER, 0, 64, 1)
+    assert (medium.end, medium.ports[0].queued, medium.ports[0].dropped) == (NEVER, 64, 1)
 
 
 def test_cut_loses_the_frame_on_the_wire() -> None:

@@ -5,12 +5,12 @@ from hypothesis import strategies as st
 
 from canopen_exo.bus.channel import Arrival, RecordArrival, RecordChannel
 from canopen_exo.bus.frame import FLAG_EXTENDED, Frame
-from canopen_exo.bus.node import NEVER, ErrorState, Out, PortState, Relay
+from canopen_exo.bus.node import NEVER, PASS_ON, TAKE, ErrorState, Out, PortState, Relay
 from canopen_exo.bus.realtime import RealTimeLoop
 from canopen_exo.bus.socketcan import decode, encode
 
 LOOKED_AT, DISTURBING, CALMING = 1, 2, 3
-"""Ids the node wants to see; the last two switch `is_disturbed` on and off."""
+"""Ids the node wants to see; after the last but one it wants to see all, up to the last one."""
 
 
 class FakeRecordChannel(RecordChannel):
@@ -73,15 +73,22 @@ class Diarist(Relay):
         super().__init__()
         self.wake_at = 10
         self.seen: list[tuple[int, int]] = []
-        for table in self.passes:
-            table[:] = bytes(can_id not in (LOOKED_AT, DISTURBING, CALMING) for can_id in range(0x800))
+        self.sees_all = False
+        self.filter()
+
+    def filter(self) -> None:
+        for port in (0, 1):
+            for can_id in range(0x10):
+                is_looked_at = self.sees_all or can_id in (LOOKED_AT, DISTURBING, CALMING)
+                self.filters[port][can_id] = TAKE if is_looked_at else PASS_ON
 
     def receive(self, now: int, port: int, frame: Frame, out: Out) -> None:
         self.frames[port] += 1
-        if self.is_disturbed or frame.can_id in (LOOKED_AT, DISTURBING, CALMING) or frame.flags:
+        if self.sees_all or frame.can_id in (LOOKED_AT, DISTURBING, CALMING) or frame.flags:
             self.seen.append((now, frame.can_id))
         if frame.can_id in (DISTURBING, CALMING):
-            self.is_disturbed = frame.can_id == DISTURBING
+            self.sees_all = frame.can_id == DISTURBING
+            self.filter()
         out.send(1 - port, frame)
 
     def wake(self, now: int, out: Out) -> None:
