@@ -18,14 +18,15 @@ from typing import Final
 import mujoco
 
 from canopen_exo.bus.frame import Frame
-from canopen_exo.bus.node import MS, SECOND, Out
+from canopen_exo.bus.node import MS, NEVER, SECOND, Out
 from canopen_exo.bus.wire import Wire
 from canopen_exo.plan import RPDO1, SDO_REQUEST, SYNC, TPDO1, BusPlan
-from fi_gateway.effects import Infinite
-from fi_gateway.events import At
-from fi_gateway.faults import Bias
+from fi_gateway.effects import Effect, Frames, Infinite
+from fi_gateway.events import At, Event, Every, Never
+from fi_gateway.faults import Bias, BitFlip, Drop, Fault
 from fi_gateway.gateway import DRIVE_PORT, Gateway
 from fi_gateway.injector import Injector, Target, stream
+from fi_gateway.trigger import Trigger
 from fi_gateway.wire_faults import BitErrorRate
 from testbench.rig import Rig, RigParams, build_rig
 from testbench.run import drive_through
@@ -171,22 +172,54 @@ def piece_figures(repeat: int) -> Figures:
         "sync_to_tpdo": piece_us(command_and_sync, repeat) - received,
         "sdo_answer": piece_us(lambda: device.receive(now, 0, read, out), repeat),
         "gateway_frame_no_injector": piece_us(lambda: rig.gateway.receive(now, DRIVE_PORT, sample, out), repeat),
-        "gateway_frame_injected": injected_us(rig, sample, repeat),
+        **engine_figures(sample, rig.params.plan, repeat),
     }
 
 
-def injected_us(rig: Rig, frame: Frame, repeat: int) -> float:
-    """A frame through a gateway whose injector adds a bias to its position, the injector included [us]."""
-    plan = rig.params.plan
+def engine_figures(frame: Frame, plan: BusPlan, repeat: int) -> Figures:
+    """A frame through a gateway with injectors [us]: not their target, one that waits, a bias, a flip, a chain of four.
+
+    Of the chain each link starts the next one with the same frame and has a window of one frame, so that each frame
+    opens, acts on and closes four windows.
+    """
     signal = next(one for one in plan.signals() if one.cob_id == frame.can_id and one.name == "position")
-    target = Target(True, False, (signal.cob_id,))
-    injector = Injector("bias", target, Bias(signal, 100), At((0,)), Infinite(), None, stream(1, 0, "bias"), True, True)
-    gateway = Gateway([injector], plan.cycle_ns)
-    out = Sink()
+    here, elsewhere = Target(True, False, (signal.cob_id,)), Target(True, False, (signal.cob_id + 1,))
+
+    def injector(
+        name: str, target: Target, fault: Fault, event: Event, effect: Effect, source: Trigger | None = None
+    ) -> Injector:
+        return Injector(name, target, fault, event, effect, source, stream(1, 0, name), True, True)
+
+    at_once, later = At((0,)), At((NEVER - 1,))
+    chain = [injector("link0", here, Bias(signal, 1), Every(1), Frames(1))]
+    for number in range(1, 4):
+        source = Trigger((f"link{number - 1}",))
+        chain.append(injector(f"link{number}", here, Bias(signal, 1), Never(), Frames(1), source))
+    loads = {
+        "engine_miss": [injector("elsewhere", elsewhere, Drop(), at_once, Infinite())],
+        "engine_armed": [injector("armed", here, Drop(), later, Infinite())],
+        "engine_bias": [injector("bias", here, Bias(signal, 100), at_once, Infinite())],
+        "engine_flip": [injector("flip", here, BitFlip(signal), at_once, Infinite())],
+        "engine_chain_of_four": chain,
+    }
+    return {name: through_us(injectors, frame, plan, repeat) for name, injectors in loads.items()}
+
+
+def through_us(injectors: list[Injector], frame: Frame, plan: BusPlan, repeat: int) -> float:
+    """A frame through a gateway with these injectors, 10 us after the one before [us]."""
+    gateway, out = Gateway(injectors, plan.cycle_ns), Sink()
     gateway.receive(0, DRIVE_PORT, frame, out)
-    spent = piece_us(lambda: gateway.receive(MS, DRIVE_PORT, frame, out), repeat)
-    if injector.manifested == 0:
-        raise RuntimeError("bench_lockstep: the injector changed no frame, its figure would be that of an idle one")
+    now = MS
+
+    def receive() -> None:
+        nonlocal now
+        now += 10_000
+        gateway.receive(now, DRIVE_PORT, frame, out)
+
+    spent = piece_us(receive, repeat)
+    for one in injectors:
+        if one.activated and one.target.cob_ids == (frame.can_id,) and one.manifested < CALLS * repeat:
+            raise RuntimeError(f"bench_lockstep: {one.name} did not change every frame, its figure would be too good")
     return spent
 
 

@@ -72,8 +72,9 @@ class Loop:
 
     def __deepcopy__(self, memo: dict[int, object]) -> "Loop":
         """The same state between two instants; the rows of the trace are shared."""
-        twin = Loop(copy.deepcopy(self.media, memo))
-        memo[id(self)] = twin
+        twin = Loop([])
+        memo[id(self)] = twin  # first: a Wire on a medium leads back here
+        twin.media.extend(copy.deepcopy(self.media, memo))
         twin.nodes = copy.deepcopy(self.nodes, memo)
         twin.outs = copy.deepcopy(self.outs, memo)
         twin.now = self.now
