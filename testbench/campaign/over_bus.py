@@ -21,7 +21,7 @@ from fi_gateway.errors import FaultError
 from fi_gateway.schema import refuse_wire_faults
 from testbench.campaign.execute import Pair, judged
 from testbench.campaign.executor import ATTEMPTS, Executor, given_up
-from testbench.campaign.records import FAILURES, Outcome, RunRow, RunSpec
+from testbench.campaign.records import FAILURES, IN_REAL_TIME, Outcome, RunRow, RunSpec
 from testbench.errors import BenchError
 from testbench.folder import write_folder
 from testbench.realtime_run import RealTimeRun, check_without, limits_in, pair_result, run_once
@@ -48,7 +48,7 @@ class Rigging:
         """For code versions and reports: what the runs were made on."""
         where = "an own hub" if self.buses is None else f"{self.buses[0]} and {self.buses[1]}"
         foreign = f" without {', '.join(sorted(self.without))}" if self.without else ""
-        return f"in real time on {where}{foreign}"
+        return f"{IN_REAL_TIME} on {where}{foreign}"
 
 
 def check_scenario(scenario: Scenario, rigging: Rigging) -> None:

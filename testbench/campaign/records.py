@@ -46,6 +46,10 @@ NO_STATEMENT: Final = frozenset({Outcome.HANG, Outcome.INVALID, Outcome.CRASHED}
 """Counted apart, never among the runs of which a share is taken."""
 
 
+IN_REAL_TIME: Final = "in real time"
+"""In the code version of runs that were made against the clock: no run in virtual time stands for one of them."""
+
+
 @dataclass(frozen=True, slots=True)
 class Point:
     """A place on the grid. parameters: (axis, value as the scenario file would say it), in the order of the axes."""

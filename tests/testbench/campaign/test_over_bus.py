@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
@@ -14,6 +15,7 @@ from testbench.realtime_run import RealTimeRun
 from testbench.scenario import parse_scenario
 from testbench.supervisor import Setup
 from tests.parity.patience import BUSY, is_lateness
+from tests.parity.six_runs import make_six_runs
 from tests.parity.walks import Bench
 from tests.testbench.campaign.specs import spec
 
@@ -103,3 +105,9 @@ def test_injectors_are_armed_over_live_control_and_act_as_the_scenario_says() ->
         assert {injection.cause for injection in row.injections} == {"event", "trigger:freeze_position"}
         assert row.metrics["right_knee.rmse_position_rad"] > 0.01
         assert row.manifested > 0
+
+
+@pytest.mark.realtime
+def test_campaign_of_six_runs_on_the_hub(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """`campaign run --realtime`: the same file, one run after another, resumed like any other."""
+    make_six_runs(HUB, [], tmp_path, capsys)
