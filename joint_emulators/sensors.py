@@ -110,6 +110,36 @@ def estimate_velocity(params: VelocityEstimateParams, state: VelocityEstimateSta
     return state.filtered
 
 
+@final
+class JointSensor:
+    """What a drive has sampled of its joint: `encode` and `estimate_velocity` in one call, after every step.
+
+    counts: of the encoder; speed: counts/s, as estimated; torque_nm: joint torque after the gear [N m].
+    """
+
+    def __init__(self, encoder: EncoderParams, velocity: VelocityEstimateParams) -> None:
+        self.counts: int = 0
+        self.speed: float = 0.0
+        self.torque_nm: float = 0.0
+        self._factor: Final[float] = encoder.factor
+        self._offset: Final[int] = encoder.offset
+        self._gain: Final[float] = velocity.gain
+        self._rate_hz: Final[float] = velocity.rate_hz
+        self._is_started: bool = False
+
+    def sample(self, q: float, tau: float) -> None:
+        """The joint is at the angle q [rad, finite], its motor gives the torque tau [N m]."""
+        value = q * self._factor / TURN + self._offset
+        counts = floor(value + 0.5) if _LOWEST < value < _HIGHEST else to_int32(value)
+        if self._is_started:
+            speed = self.speed
+            self.speed = speed + self._gain * ((counts - self.counts) * self._rate_hz - speed)
+        else:
+            self._is_started = True
+        self.counts = counts
+        self.torque_nm = tau
+
+
 @dataclass(frozen=True, slots=True)
 class HallParams:
     """pole_pairs: electrical turns per shaft turn; gear_ratio: shaft turns per joint turn.
