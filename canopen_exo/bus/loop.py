@@ -2,6 +2,9 @@
 
 At each instant: frames that end (by bus; each bus ends at most one), then nodes that are due (by index), then idle
 buses arbitrate. No clock is read: the same nodes give the same trace on every machine.
+
+A frame goes to the nodes whose acceptance filter takes it (`Node.filters`). What a Relay only passes on is put into the
+queue of its other port here, which is what its `receive` would do.
 """
 
 from typing import Final, final
@@ -93,7 +96,10 @@ class Loop:
         self.outs.append(MediumOut())
 
     def run_until(self, until: int) -> None:
-        """Serve every instant up to and including `until` [ns]."""
+        """Serve every instant up to and including `until` [ns].
+
+        Longer than a function should be: nearly all instants are the end of one frame, and each call for one counts.
+        """
         if until < self.now:
             raise CanopenExoError(f"loop: run until {until} ns given, it is {self.now} ns; time does not go back")
         now = self.now

@@ -223,7 +223,6 @@ def status_rows(bench: Bench) -> list[tuple[int, tuple[int, int, int]]]:
 # ---- enabling -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("joint", range(6))
 def test_command_that_recurs_is_the_same_frame_and_only_so_many_are_kept() -> None:
     """RPDO1 with controlword 0x0F and the torque, int16; what is remembered is bounded."""
     commands = CommandFrames(0x205, PLAN.pdo("RPDO1"))
@@ -234,6 +233,7 @@ def test_command_that_recurs_is_the_same_frame_and_only_so_many_are_kept() -> No
         assert len(commands.known) <= COMMANDS_KEPT
 
 
+@pytest.mark.parametrize("joint", range(6))
 def test_drives_are_enabled_state_by_state(walked: Bench, joint: int) -> None:
     """CiA 402-2: nothing before the first statusword, then 06, 07, 0F as the statusword shows; at the end 00."""
     assert walked.sent_words(joint) == [0x00, 0x06, 0x07, 0x0F, 0x00]
