@@ -13,7 +13,7 @@ from canopen_exo.device import Device
 from canopen_exo.plan import SYNC
 from joint_emulators.drive import Drive
 from joint_emulators.plant import STEP_NS, Plant
-from joint_emulators.sensors import JointSensor
+from joint_emulators.sensors import JointSensor, sample
 
 
 @final
@@ -49,7 +49,7 @@ class Rack(Node):
         self._filter: Final[bytearray] = open_filter()
         self.filters = [self._filter] * len(devices)
         self._route()
-        self._sense()
+        sample(self._sensors, plant.q, plant.tau)
 
     def receive(self, now: int, port: int, frame: Frame, out: Out) -> None:
         """A frame on the drive bus: to the devices that listen to its id."""
@@ -113,14 +113,9 @@ class Rack(Node):
             torques[joint] = drive.torque_nm
         plant = self.plant
         plant.step(torques)
-        self._sense()
+        sample(self._sensors, plant.q, plant.tau)
         self.truth.append(TruthRow(now, plant.q, plant.dq, plant.tau))
         self.step_at += STEP_NS
-
-    def _sense(self) -> None:
-        q, tau = self.plant.q, self.plant.tau
-        for joint, sensor in enumerate(self._sensors):
-            sensor.sample(q[joint], tau[joint])
 
     def _route(self) -> None:
         """Which devices hear which 11-bit id."""

@@ -112,7 +112,7 @@ def estimate_velocity(params: VelocityEstimateParams, state: VelocityEstimateSta
 
 @final
 class JointSensor:
-    """What a drive has sampled of its joint: `encode` and `estimate_velocity` in one call, after every step.
+    """What a drive has sampled of its joint, by `sample`.
 
     counts: of the encoder; speed: counts/s, as estimated; torque_nm: joint torque after the gear [N m].
     """
@@ -121,23 +121,28 @@ class JointSensor:
         self.counts: int = 0
         self.speed: float = 0.0
         self.torque_nm: float = 0.0
-        self._factor: Final[float] = encoder.factor
-        self._offset: Final[int] = encoder.offset
-        self._gain: Final[float] = velocity.gain
-        self._rate_hz: Final[float] = velocity.rate_hz
-        self._is_started: bool = False
+        self.is_started: bool = False
+        self.factor: Final[float] = encoder.factor
+        self.offset: Final[int] = encoder.offset
+        self.gain: Final[float] = velocity.gain
+        self.rate_hz: Final[float] = velocity.rate_hz
 
-    def sample(self, q: float, tau: float) -> None:
-        """The joint is at the angle q [rad, finite], its motor gives the torque tau [N m]."""
-        value = q * self._factor / TURN + self._offset
+
+def sample(sensors: list[JointSensor], q: list[float], tau: list[float]) -> None:
+    """`encode` and `estimate_velocity` for all joints in one call, after every step.
+
+    q: joint angles [rad, finite]; tau: torques of the motors after the gear [N m].
+    """
+    for joint, sensor in enumerate(sensors):
+        value = q[joint] * sensor.factor / TURN + sensor.offset
         counts = floor(value + 0.5) if _LOWEST < value < _HIGHEST else to_int32(value)
-        if self._is_started:
-            speed = self.speed
-            self.speed = speed + self._gain * ((counts - self.counts) * self._rate_hz - speed)
+        if sensor.is_started:
+            speed = sensor.speed
+            sensor.speed = speed + sensor.gain * ((counts - sensor.counts) * sensor.rate_hz - speed)
         else:
-            self._is_started = True
-        self.counts = counts
-        self.torque_nm = tau
+            sensor.is_started = True
+        sensor.counts = counts
+        sensor.torque_nm = tau[joint]
 
 
 @dataclass(frozen=True, slots=True)

@@ -109,7 +109,7 @@ class Loop:
         media = self.media
         ends, frames, senders = self._ends, self._frames, self._senders
         first = self._nowhere
-        is_alone, is_due = True, False
+        is_shared = is_due = False
         bound = wake if wake <= until else until + 1  # frames that end before it come next
         while True:
             # idle buses arbitrate (at first: what was queued between two calls); then it shows which frame ends first
@@ -136,8 +136,8 @@ class Loop:
                     end = at
                     first = medium
                 elif at == end:
-                    is_alone = False
-            if end < bound and is_alone and not first.is_watched:  # nearly always: one plain frame and nothing else
+                    is_shared = True
+            if end < bound and not first.is_watched:  # nearly always: a plain frame, and nobody to be woken
                 now = end
                 first.end = NEVER
                 frame, sender = first.on_wire
@@ -162,19 +162,20 @@ class Loop:
                             wake = node.wake_at
                             is_due = wake <= now
                             bound = wake if wake <= until else until + 1
-                if not is_due:
+                if not is_due and not is_shared:
                     continue
             else:
                 now = end if end < wake else wake
                 if now > until:
                     break
-                is_alone = True
+                is_shared = True
+            if is_shared:  # the other frames of this instant
                 for medium in media:
                     if medium.end == now:
                         medium.end = NEVER
                         self._end(now, medium)
                 wake = self._first_wake()
-            is_due = False
+            is_shared = is_due = False
             if wake <= now:
                 wake = self._wake(now)
             bound = wake if wake <= until else until + 1

@@ -23,6 +23,7 @@ from joint_emulators.sensors import (
     encode,
     estimate_velocity,
     hall_state,
+    sample,
     to_int32,
 )
 
@@ -92,11 +93,11 @@ def run_estimate(counts: list[int], params: VelocityEstimateParams = VELOCITY) -
 def test_sensor_of_a_joint_is_encoder_and_speed_estimate_in_one(
     angles: list[float], offset: int, direction: int
 ) -> None:
-    """JointSensor: to the last bit what `encode` and `estimate_velocity` give, beyond int32 too."""
+    """`sample`: to the last bit what `encode` and `estimate_velocity` give, beyond int32 too."""
     params = EncoderParams(131072, offset, direction)
     sensor, state = JointSensor(params, VELOCITY), VelocityEstimateState()
     for at, q in enumerate(angles):
-        sensor.sample(q, float(at))
+        sample([sensor], [q], [float(at)])
         counts = encode(q, params)
         speed = estimate_velocity(VELOCITY, state, counts)
         assert (sensor.counts, sensor.speed, sensor.torque_nm) == (counts, speed, at)
