@@ -28,7 +28,7 @@ endif
 
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test lint unit runs realtime vcan compile bench soak lock clean moved
+.PHONY: help setup demo test lint unit runs realtime vcan compile bench soak paper lock clean moved
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-8s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -90,6 +90,19 @@ bench: $(READY) ## measured ratios against the budgets; nothing is asserted
 
 soak: $(READY) ## ten million frames through the gateway, then a full bus: none lost, doubled, changed or out of order
 	$(BIN)/python -m benchmarks.soak
+
+paper: $(READY) ## the campaigns of docs/paper.md, and its tables from them: an hour or two; goes on where it was
+	@run() { echo "campaign run $$*"; $(BIN)/exo-hil campaign run "$$@" || [ $$? = 3 ]; }; to=results/campaigns; set -e; \
+	run campaigns/rmse_over_duration.yaml --out $$to/rmse_over_duration.sqlite; \
+	run campaigns/rmse_over_duration.yaml --out $$to/rmse_over_duration-pins.sqlite --set rig.stops=on; \
+	run campaigns/compensated.yaml --out $$to/compensated.sqlite; \
+	run campaigns/compensated.yaml --out $$to/compensated-pins.sqlite --set rig.stops=on; \
+	run campaigns/critical_duration.yaml --out $$to/critical_duration.sqlite; \
+	run campaigns/critical_duration.yaml --out $$to/critical_duration-3deg.sqlite --set 'tolerance=3 deg'; \
+	run campaigns/small_faults.yaml --out $$to/small_faults.sqlite; \
+	run campaigns/small_faults.yaml --out $$to/small_faults-pins.sqlite --set rig.stops=on; \
+	run campaigns/bit_flips.yaml --out $$to/bit_flips.sqlite
+	$(BIN)/python -m testbench.campaign.markdown docs/paper.md
 
 lock: ## for maintainers: newest versions allowed by pyproject.toml into requirements.lock, for all platforms
 	@rm -rf build/lock && $(PYTHON) -m venv build/lock && build/lock/bin/python -m pip install --quiet uv

@@ -102,8 +102,20 @@ class Stream:
         return f"{place}: {got.hex()} came out, due was {due}: doubled or changed"
 
 
+def settle(bench: Bench) -> None:
+    """Take what the waiting for the forwarder has left on its way: all that comes before a frame sent now."""
+    for here, there in (bench.far, bench.far[::-1]):
+        here.send(record(0x7E5, b"begin"))
+        while select.select([there], [], [], PATIENCE_S)[0]:
+            if there.recv(FD_SIZE) == record(0x7E5, b"begin"):
+                break
+        else:
+            raise SystemExit("soak: the first frame did not come out")
+
+
 def soak(bench: Bench, frames: int, what: str) -> None:
     """That many frames, half of them each way; raises SystemExit, saying which frame, when one does not come right."""
+    settle(bench)
     for end in bench.far:
         end.setblocking(False)
     left, right = bench.far

@@ -8,8 +8,15 @@ The loss of SYNC after a number of periods is a drive's own supervision (no CiA 
 from typing import Final, final
 
 from canopen_exo.bus.frame import Frame
-from canopen_exo.bus.node import NEVER
+from canopen_exo.bus.node import MS, NEVER
 from canopen_exo.plan import SYNC
+
+_PAUSE_NS: Final = 100 * MS
+"""Five of the longest cycles: a SYNC after such a silence begins anew."""
+
+_CERTAIN_NS: Final = 200 * MS
+_CERTAIN_SHARE: Final = 50
+"""No lateness makes as much, and no two clocks are 1/50 apart: the producer has another cycle."""
 
 
 @final
@@ -79,3 +86,45 @@ class SyncConsumer:
         self.lost = True
         self.is_steady = False
         return True
+
+
+@final
+class SyncCadence:
+    """Whether SYNC comes as often as was said. cycle_ns: that; last: when the last one came, ns."""
+
+    def __init__(self, cycle_ns: int, first: int = -NEVER, last: int = -NEVER, count: int = 0) -> None:
+        self.cycle_ns: Final[int] = cycle_ns
+        self.last: int = last
+        self._first: int = first
+        self._count: int = count
+
+    def received(self, now: int) -> None:
+        """A SYNC came."""
+        if now - self.last > _PAUSE_NS:
+            self._first = now
+            self._count = 0
+        else:
+            self._count += 1
+        self.last = now
+
+    @property
+    def other_ns(self) -> int:
+        """The producer's cycle, when it is certainly not `cycle_ns`; 0: it is, or too few have come to tell."""
+        due_ns = self._count * self.cycle_ns
+        off_ns = abs(self.last - self._first - due_ns)
+        if off_ns <= _CERTAIN_NS or off_ns * _CERTAIN_SHARE <= due_ns:
+            return 0
+        return (self.last - self._first) // self._count
+
+    def words(self) -> str:
+        """That it is another, and what to do; "" when it is not."""
+        other_ns = self.other_ns
+        if not other_ns:
+            return ""
+        return (
+            f"SYNC comes every {other_ns / 1e6:.2f} ms, rig.rate here says {self.cycle_ns / 1e6:g} ms "
+            f"({1e9 / self.cycle_ns:g} Hz); give all processes of a rig the same rig.rate"
+        )
+
+    def __reduce__(self) -> tuple[type["SyncCadence"], tuple[int, int, int, int]]:
+        return SyncCadence, (self.cycle_ns, self._first, self.last, self._count)

@@ -50,6 +50,10 @@ class EventSpec(SpecModel):
         """Whether it comes with frames of the target; its stand-in has the k-th frame at k times their distance."""
         return False
 
+    def counts_cycles(self) -> bool:
+        """Whether it hangs on how long a control cycle is."""
+        return False
+
     def times(self) -> tuple[int, ...]:
         """The times at which it happens [ns], in order, where the file gives them; else ()."""
         return ()
@@ -124,6 +128,10 @@ class FailureProbabilitySpec(EventSpec):
     def counts_frames(self) -> bool:
         """Per frame it does."""
         return self.per == "frame"
+
+    def counts_cycles(self) -> bool:
+        """Per `sync` it does."""
+        return self.per == "sync"
 
     def silent(self, plan: BusPlan) -> str:
         """With p = 0."""

@@ -30,6 +30,7 @@ from mypy_extensions import mypyc_attr
 from canopen_exo.bus.frame import Frame
 from canopen_exo.bus.node import MS, NEVER, PASS_ON, TAKE, ErrorState, Out, PortState, Relay
 from canopen_exo.plan import STATUS_MOTION, STATUS_STOPPED
+from canopen_exo.sync import SyncCadence
 from fi_gateway.activation import Activation
 from fi_gateway.errors import FaultError
 from fi_gateway.injector import Injector
@@ -48,7 +49,7 @@ _STATE: Final = (
     "port_changes",
     "malformed",
     "time_zero",
-    "_last_sync",
+    "cadence",
     "_power_up",
     "_states",
     "_away",
@@ -121,7 +122,8 @@ class Gateway(Relay):
     original.
     frames, lost, inserted, undelivered: received, lost and added by faults, and not offered because the other port is
     away, by the port they came in on; waiting: frames that go on later; notices: error notices by port; port_changes:
-    those that changed a port's state; malformed: status frames too short to read. time_zero: ns, NEVER until known.
+    those that changed a port's state; malformed: status frames too short to read. time_zero: ns, NEVER until known;
+    cadence: of SYNC from the controller.
 
     Ten public methods: four are a Node's life and its end, five are live control's, one is for wire faults.
     """
@@ -136,8 +138,8 @@ class Gateway(Relay):
         self.port_changes: list[PortChange] = []
         self.malformed: int = 0
         self.time_zero: int = NEVER
+        self.cadence: SyncCadence = SyncCadence(cycle_ns)
         self._cycle_ns: Final[int] = cycle_ns
-        self._last_sync: int = -NEVER
         self._power_up: int = 0
         self._commands: CommandPort | None = None
         self._states: list[ErrorState] = [ErrorState.ERROR_ACTIVE, ErrorState.ERROR_ACTIVE]
@@ -323,7 +325,7 @@ class Gateway(Relay):
     def _observe(self, now: int, kind: int, frame: Frame) -> None:
         """Look for time 0 in SYNC and status frames from the controller, then for the end of the motion."""
         if kind == SYNC_READ:
-            self._last_sync = now
+            self.cadence.received(now)
         elif len(frame.data) < 3:
             self.malformed += 1
         elif self.time_zero != NEVER:
@@ -333,9 +335,9 @@ class Gateway(Relay):
                     if not injector.from_power_up:
                         injector.stop(now)
                 self._passage.settle(now)
-        elif frame.data[0] == STATUS_MOTION and now - self._last_sync < self._cycle_ns:
+        elif frame.data[0] == STATUS_MOTION and now - self.cadence.last < self._cycle_ns:
             cycle = frame.data[1] | frame.data[2] << 8
-            self.begin(self._last_sync - cycle * self._cycle_ns)
+            self.begin(self.cadence.last - cycle * self._cycle_ns)
             self._passage.settle(now)
 
     def _arrange(self, now: int) -> None:

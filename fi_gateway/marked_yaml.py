@@ -28,6 +28,7 @@ MAX_DEPTH: Final = 32
 _INTEGER: Final = re.compile(r"[-+]?[0-9]{1,30}|0x[0-9a-fA-F]{1,24}", re.ASCII)
 _FLOAT: Final = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?", re.ASCII)
 _BREAKS: Final = re.compile("[\x85\u2028\u2029\ufeff]")
+_FLOW: Final = re.compile(r"[\[\]{},#\n]")
 _NOT_FINITE: Final = re.compile(r"[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)")
 _WORDS: Final[dict[str, bool | None]] = {
     **dict.fromkeys(("true", "True", "TRUE"), True),
@@ -177,6 +178,20 @@ def write(data: dict[str, Data]) -> str:
     return yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=110)
 
 
+def flow_text(data: Data) -> str:
+    """One line of YAML that `parse` and `set_value` read as the same data; a text is left as it is where that does."""
+    if isinstance(data, str) and data == data.strip() and not _FLOW.search(data):
+        try:
+            if parse(data, "value").data == data:
+                return data
+        except FileErrors:
+            pass
+    text: str = yaml.dump(
+        data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=math.inf, default_flow_style=True
+    )
+    return text.removesuffix("...\n").strip()
+
+
 class _Dumper(yaml.SafeDumper):
     """Puts quotes around texts that only our notation of numbers takes for a number, such as 1e3.
 
@@ -201,10 +216,15 @@ def apply_override(document: Document, override: str) -> None:
     key, equals, text = override.partition("=")
     document.overrides += 1
     origin = Mark(document.overrides, 0, f"--set {override}")
-    parts = key.strip().split(".")
-    if not equals or not all(parts):
+    if not equals or not all(key.strip().split(".")):
         document.problems.append(Problem((), origin, "expected key=value, such as motion.duration=7s"))
         return
+    set_value(document, key.strip(), text, origin)
+
+
+def set_value(document: Document, key: str, text: str, origin: Mark) -> None:
+    """As apply_override, whatever the value came from: messages about it begin with `origin.override`."""
+    parts = key.split(".")
     value = Document(origin.override)
     try:
         _read(value, text)

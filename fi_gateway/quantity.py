@@ -140,6 +140,20 @@ def format_quantity(value: float, dimension: Dimension) -> str:
     return f"{number.removesuffix('.0')} {si_unit(dimension)}"
 
 
+def split_quantity(text: str) -> tuple[Fraction, str] | None:
+    """Number, exactly, and unit of a text such as "0.3 s" or "5", whatever the unit; None when it is no such text."""
+    match = _match(text)
+    if match is None or Decimal(match[1]).adjusted() > _MAX_EXPONENT:
+        return None
+    unit = " ".join(match[2].split())
+    return Fraction(Decimal(match[1])), _SPELLINGS.get(unit, unit)
+
+
+def format_number(number: Fraction) -> str:
+    """Exact decimal notation without exponent and trailing zeros; raises QuantityError when there is none."""
+    return _plain(number)
+
+
 def si_unit(dimension: Dimension) -> str:
     """The unit of what `parse_quantity` returns."""
     return next(iter(UNITS[dimension]))

@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from testbench.cli_campaign import add_campaign_verbs
 from testbench.cli_rig import CONTROL_ADDRESS, HUB_ADDRESS, add_rig_options, add_verbs, named_buses
 
 if TYPE_CHECKING:
@@ -81,11 +82,12 @@ def _parser() -> argparse.ArgumentParser:
     run.set_defaults(verb=_run)
 
     check = verbs.add_parser("check", help="validate a scenario and say what it will do", description=_check.__doc__)
-    check.add_argument("scenario", type=Path, metavar="FILE", help="a scenario, or faults for `exo-hil gateway`")
+    check.add_argument("scenario", type=Path, metavar="FILE", help="a scenario, a campaign, or faults for a gateway")
     check.add_argument("--seed", metavar="N", help="instead of the scenario's seed")
     check.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="overrides", help="as for run")
     check.set_defaults(verb=_check)
 
+    add_campaign_verbs(verbs, _print)
     add_verbs(verbs)
 
     export = verbs.add_parser("export", help="write files for other tools", description=_export.__doc__)
@@ -120,7 +122,7 @@ def _run(options: argparse.Namespace) -> int:
     from fi_gateway.marked_yaml import FileErrors
     from fi_gateway.schema import refuse_wire_faults
     from testbench.errors import BenchError
-    from testbench.store import check_folder, default_folder, result_files, write_result
+    from testbench.store import check_folder, default_folder
     from testbench.summary import summary_json, summary_text
 
     try:
@@ -141,9 +143,8 @@ def _run(options: argparse.Namespace) -> int:
         _say(f"warning: {warning}")
 
     from canopen_exo.errors import CanopenExoError
-    from hlc.limits import limits_of
     from joint_emulators.errors import JointEmulatorError
-    from testbench.report import Plotted, plot_files
+    from testbench.folder import write_folder
 
     try:
         with _progress(scenario.name) as progress:
@@ -164,15 +165,8 @@ def _run(options: argparse.Namespace) -> int:
         return INVALID
     if replay is not None:
         result.document["replay"] = replay.entry(result.document)
-    names = tuple(joint.name for joint in scenario.plan.joints)
-    limits = {name: limits_of(name) for name in names}
-    title = f"{scenario.name}, seed {scenario.seed}"
-    files = result_files(scenario.resolved_yaml(), result.document, names, result.golden, result.faulted)
-    triggers = {name: spec.trigger for name, spec in scenario.injectors.items() if spec.trigger is not None}
-    shown = Plotted(title, names, limits, result.golden, result.faulted, result.judgement, triggers)
-    files.update(plot_files(shown))
     try:
-        written = write_result(folder, files)
+        written = write_folder(folder, result)
     except BenchError as error:
         _say(str(error))
         return USAGE
@@ -221,8 +215,10 @@ def _real_time_buses(options: argparse.Namespace) -> tuple[str, str] | None:
 
 
 def _check(options: argparse.Namespace) -> int:
-    """Validate a scenario, or a file of faults for the gateway, and say in words what it will do; nothing is run."""
+    """Validate a scenario, a campaign, or a file of faults for the gateway, and say in words what it will do."""
     from fi_gateway.marked_yaml import FileErrors
+    from testbench.campaign.schema import is_campaign_file
+    from testbench.cli_campaign import check_campaign
     from testbench.fault_file import FaultFile, describe_faults, load_any
     from testbench.scenario import describe
 
@@ -230,6 +226,8 @@ def _check(options: argparse.Namespace) -> int:
     if options.seed is not None:
         overrides.append(f"seed={options.seed}")
     try:
+        if is_campaign_file(options.scenario):
+            return check_campaign(options.scenario, options.overrides, options.seed, _print)
         found = load_any(options.scenario, overrides)
     except FileErrors as error:
         _say(_as_typed(error, options))

@@ -2,7 +2,8 @@
 
 The first SIGINT stops injecting and frames pass on until `exo-hil fault resume`; the second one, or SIGTERM, ends it.
 It says what it stands between when it is ready, what is lost when that first happens, and what went through it, by
-direction, at its end.
+direction, at its end. A controller that sends SYNC at another rate than the faults count by is told at once, and once
+more by exit code 3.
 On Linux a second gateway between the same two buses is refused: with two, every frame would go round for ever.
 Needs neither MuJoCo nor the controller.
 """
@@ -17,6 +18,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from canopen_exo.bus.interfaces import BusName, bus_identity
+from canopen_exo.bus.node import NEVER, SECOND
 from fi_gateway.bus_control import DEFAULT_COMMAND_ID, DEFAULT_STATUS_ID, BusControl
 from fi_gateway.control import (
     ARM,
@@ -35,7 +37,7 @@ from fi_gateway.control_socket import ControlServer
 from fi_gateway.errors import FaultError
 from fi_gateway.gateway import CONTROLLER_PORT, DRIVE_PORT, Gateway
 from testbench.errors import BenchError
-from testbench.process import DONE, ProcessOptions, Session, say, session
+from testbench.process import DONE, INVALID, ProcessOptions, Session, say, session
 
 if TYPE_CHECKING:
     from testbench.fault_file import FaultFile
@@ -50,6 +52,9 @@ _DONE: Final = {
 }
 _IGNORED: Final = "{name}: not triggered, it is active, or waits for a value, already"
 """What `exo-hil fault` says when it has asked."""
+
+_LOOK_NS: Final = SECOND
+"""How often it looks at the rate of SYNC."""
 
 SIDES: Final = {"controller": CONTROLLER_PORT, "drive": DRIVE_PORT}
 
@@ -75,7 +80,10 @@ class GatewayOptions:
 def gateway_main(
     faults: "FaultFile", buses: tuple[BusName, BusName], options: ProcessOptions, given: GatewayOptions
 ) -> int:
-    """The gateway between two buses, until told to end. Raises BenchError, FaultError."""
+    """The gateway between two buses, until told to end. Raises BenchError, FaultError.
+
+    INVALID: faults that count control cycles had another length of them than the controller.
+    """
     from fi_gateway.addition import Additions
     from fi_gateway.schema import refuse_wire_faults
 
@@ -96,7 +104,8 @@ def gateway_main(
                 if server.is_exposed:
                     say("gateway", f"warning: {server.address} can be reached from other machines")
             say("gateway", f"between {buses[0]} (controller) and {buses[1]} (drives); {_injectors_text(gateway)}")
-            _serve(process, control, server, server is not None or given.frames is not None)
+            counts_cycles = given.faults and any(one.event.counts_cycles() for one in faults.injectors.values())
+            is_valid = _serve(process, control, server, server is not None or given.frames is not None, counts_cycles)
         gateway.finish(process.loop.now())
         if options.part is not None:
             _leave_part(options, process, control)
@@ -104,7 +113,7 @@ def gateway_main(
         for text in (statistics_text(directions), changes_text(directions), latency_text(directions)):
             for line in text.splitlines():
                 say("gateway", line)
-    return DONE
+    return DONE if is_valid else INVALID
 
 
 def claimed(buses: tuple[BusName, BusName]) -> AbstractContextManager[object]:
@@ -184,15 +193,32 @@ def active_faults(address: str) -> list[str]:
     return [row.name for row in listing.injectors if row.state == Phase.ACTIVE.value]
 
 
-def _serve(process: Session, control: LiveControl, server: ControlServer | None, can_resume: bool) -> None:
-    """Until told to end. can_resume: there is live control to resume injection with."""
+def _serve(
+    process: Session, control: LiveControl, server: ControlServer | None, can_resume: bool, counts_cycles: bool
+) -> bool:
+    """Until told to end; False when what was injected counted cycles of the wrong length.
+
+    can_resume: there is live control to resume injection with; counts_cycles: an injector does.
+    """
     interrupted = False
+    is_valid = True
+    look_at = 0
     how = "`exo-hil fault resume` resumes" if can_resume else "nothing resumes it without --control"
 
+    def judge() -> None:
+        nonlocal is_valid
+        other = _other_rate(control, counts_cycles) if is_valid else ""
+        if other:
+            is_valid = False
+            say("gateway", f"error: {other}")
+
     def is_over(now: int) -> bool:
-        nonlocal interrupted
+        nonlocal interrupted, look_at
         if server is not None:
             server.tidy(now)
+        if now >= look_at:
+            look_at = now + _LOOK_NS
+            judge()
         orders = process.orders
         if orders.interrupts and not interrupted:
             interrupted = True
@@ -201,6 +227,16 @@ def _serve(process: Session, control: LiveControl, server: ControlServer | None,
         return orders.terminations > 0 or orders.interrupts > 1
 
     process.run(is_over)
+    judge()
+    return is_valid
+
+
+def _other_rate(control: LiveControl, counts_cycles: bool) -> str:
+    """Why the faults act at wrong times, "" when they do not: by the rate of SYNC, where anything hangs on it."""
+    gateway = control.gateway
+    by_hand = any(row.what == START and not row.refused for row in control.rows)
+    by_cycles = gateway.time_zero != NEVER and not by_hand
+    return gateway.cadence.words() if gateway.injectors and (counts_cycles or by_cycles) else ""
 
 
 def _leave_part(options: ProcessOptions, process: Session, control: LiveControl) -> None:

@@ -20,6 +20,7 @@ from canopen_exo.bus.node import MS, NEVER
 from canopen_exo.cia402 import DriveState, decode_statusword
 from canopen_exo.plan import BusPlan, Pdo
 from canopen_exo.signal import Codec
+from canopen_exo.sync import SyncCadence
 from testbench.errors import BenchError
 from testbench.parts import GatewayPart, HlcPart, JointsPart
 from testbench.record import Array, BusStats, Commands, RigEvent, RunRecord, Truth
@@ -76,7 +77,7 @@ def merge(
         completed=given_up is None if hlc is None else hlc.completed,
         held_cycles=[0] * len(plan.joints) if hlc is None else list(hlc.held),
         source=PLANT if joints is not None else BUS,
-        invalid_reasons=_zeros_apart(plan, hlc, gateway),
+        invalid_reasons=_zeros_apart(plan, hlc, gateway) + _other_rate(plan, rows, zero, end),
     )
 
 
@@ -95,6 +96,16 @@ def _zeros_apart(plan: BusPlan, hlc: HlcPart | None, gateway: GatewayPart | None
         f"allowed is less than a cycle ({plan.cycle_ns / 1e6:g} ms): it missed a SYNC or a status frame, or somebody "
         "said `exo-hil fault start` although the controller tells time 0"
     ]
+
+
+def _other_rate(plan: BusPlan, rows: list[Transmission], zero: int, end: int) -> list[str]:
+    """Cycles are judged and counted by the plan: why they are not those of the controller."""
+    cadence = SyncCadence(plan.cycle_ns)
+    for row in rows:
+        is_sync = row.frame.can_id == ids.SYNC and row.frame.flags == 0
+        if is_sync and row.bus == CONTROLLER_BUS and row.sender < 0 and zero <= row.end_ns <= end:
+            cadence.received(row.end_ns)
+    return [text for text in (cadence.words(),) if text]
 
 
 def time_zero_of(plan: BusPlan, hlc: HlcPart | None, gateway: GatewayPart | None, heard: list[Transmission]) -> int:

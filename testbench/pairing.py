@@ -71,8 +71,8 @@ def pair(sent: list[Transmission], received: list[Transmission], slack_ns: int) 
         while newest >= 0 and sent[newest].end_ns > row.end_ns + slack_ns:
             newest -= 1
         at = _place_of(row, sent, newest, left)
-        is_before = k > 0 and newest >= 0 and received[k - 1].frame == sent[newest].frame
-        if at < 0 or (at != newest and is_before):  # without this one the two records agree again
+        is_before = k > 0 and at < newest and received[k - 1].frame == sent[newest].frame
+        if at < 0 or is_before:  # without this one the two records agree again
             found.extra.append(row)
             continue
         found.missing += reversed(sent[at + 1 : left])
@@ -86,7 +86,7 @@ def pair(sent: list[Transmission], received: list[Transmission], slack_ns: int) 
 
 
 def _place_of(row: Transmission, sent: list[Transmission], newest: int, left: int) -> int:
-    """The newest equal frame up to `newest`; else the oldest behind it, whose time is then wrong; -1: there is none."""
+    """The newest equal frame up to `newest`; else the oldest behind it, a wrong stamp then; -1: there is none."""
     for at in range(newest, -1, -1):
         if sent[at].frame == row.frame:
             return at

@@ -34,6 +34,8 @@ if TYPE_CHECKING:  # numpy, and with it everything heavy
     from testbench.scenario import Scenario
 
 DONE: Final = 0
+INVALID: Final = 3
+"""What went through proves nothing."""
 ENDED_EARLY: Final = 4
 """The controller gave the motion up; its part says why. No code that a crash has: 1 is the interpreter's own."""
 

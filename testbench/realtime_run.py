@@ -15,18 +15,17 @@ from typing import Final, TypeVar
 from canopen_exo.bus.node import NEVER, SECOND
 from fi_gateway.control_socket import ask_listing
 from fi_gateway.errors import FaultError
-from hlc.limits import limits_of
 from testbench.child import Process, ProcessError
+from testbench.document import RealTimeEntry, RealTimeRunEntry
 from testbench.errors import BenchError
 from testbench.merge import IncompleteError, add_reasons, merge, time_zero_of
 from testbench.parts import PartError, read_gateway, read_hlc, read_joints
 from testbench.record import RunRecord
-from testbench.run import CHUNK_NS, LEAVE_NS, START_NS, Progress, Result
+from testbench.run import CHUNK_NS, LEAVE_NS, START_NS, Progress, Result, judge_pair
 from testbench.scenario import Scenario
-from testbench.summary import RealTimeEntry, RealTimeRunEntry, summary_document
+from testbench.summary import summary_document
 from testbench.supervisor import Setup, Supervisor, check_status_readers
 from testbench.timing import Timing, TimingLimits, judge_timing
-from testbench.verdict import judge
 
 TAIL_NS: Final = SECOND // 2
 """How long a rig without our controller is listened to after the motion."""
@@ -73,16 +72,7 @@ def run_realtime(
             golden, faulted = _run_pair(setup, progress, announce, host.processes["hub"])
     else:
         golden, faulted = _run_pair(setup, progress, announce, None)
-    names = tuple(joint.name for joint in scenario.plan.joints)
-    judgement = judge(
-        names,
-        {name: limits_of(name) for name in names},
-        golden.record,
-        faulted.record,
-        tolerance_rad=scenario.tolerance_rad,
-        fail_on=scenario.fail_on,
-        expectations=scenario.expect,
-    )
+    judgement = judge_pair(scenario, golden.record, faulted.record)
     document = summary_document(
         scenario.name,
         scenario.seed,

@@ -11,11 +11,11 @@ from canopen_exo.bus.node import NEVER
 from fi_gateway.errors import FaultError
 from fi_gateway.replay import Window
 from fi_gateway.rng_state import restore
+from testbench.document import ReplayEntry, Summary
 from testbench.errors import BenchError
 from testbench.injections import INJECTIONS_FILE, read_injections
 from testbench.scenario import Scenario, load_scenario
 from testbench.store import SCENARIO_FILE, SUMMARY_FILE
-from testbench.summary import ReplayEntry, Summary
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,25 +6,28 @@ them comes from the faults.
 
 import gc
 import time
-from collections.abc import Callable, Mapping
+from bisect import bisect_right
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
 from canopen_exo.bus.frame import FLAG_ERROR
-from canopen_exo.bus.medium import Medium
+from canopen_exo.bus.medium import Transmission
 from canopen_exo.bus.node import MS, NEVER, SECOND
 from fi_gateway.injector import Injector
 from fi_gateway.replay import Window
 from fi_gateway.schema import build_injectors
 from hlc.limits import limits_of
 from hlc.node import HighLevelController, Phase
+from testbench.document import Summary
 from testbench.errors import BenchError
 from testbench.record import BusStats, Commands, RigEvent, RunRecord, Truth
 from testbench.rig import Rig, RigParams, build_rig
 from testbench.scenario import Scenario
-from testbench.summary import Summary, summary_document
+from testbench.summary import summary_document
 from testbench.verdict import Judgement, judge
 
 CHUNK_NS: Final = 50 * MS
@@ -69,8 +72,31 @@ def run_scenario(
     golden, golden_ns = run_rig(params, [], lambda share: progress(0.5 * share))
     injectors = build_injectors(scenario.injectors, params.plan, scenario.seed, 0, recorded)
     faulted, faulted_ns = run_rig(params, injectors, lambda share: progress(0.5 + 0.5 * share))
-    names = tuple(joint.name for joint in params.plan.joints)
-    judgement = judge(
+    wall_time_s = time.perf_counter() - started
+    return result_of(scenario, golden, faulted, sim_time_s=(golden_ns + faulted_ns) / 1e9, wall_time_s=wall_time_s)
+
+
+def result_of(
+    scenario: Scenario, golden: RunRecord, faulted: RunRecord, *, sim_time_s: float, wall_time_s: float
+) -> Result:
+    """The pair of runs judged, and what is said about it. sim_time_s, wall_time_s: of the runs made for it."""
+    judgement = judge_pair(scenario, golden, faulted)
+    document = summary_document(
+        scenario.name,
+        scenario.seed,
+        golden,
+        faulted,
+        judgement,
+        sim_time_s=sim_time_s,
+        wall_time_s=wall_time_s,
+    )
+    return Result(scenario, golden, faulted, judgement, document)
+
+
+def judge_pair(scenario: Scenario, golden: RunRecord, faulted: RunRecord) -> Judgement:
+    """As the scenario wants it judged, by the table's limits of its joints."""
+    names = tuple(joint.name for joint in scenario.plan.joints)
+    return judge(
         names,
         {name: limits_of(name) for name in names},
         golden,
@@ -79,16 +105,6 @@ def run_scenario(
         fail_on=scenario.fail_on,
         expectations=scenario.expect,
     )
-    document = summary_document(
-        scenario.name,
-        scenario.seed,
-        golden,
-        faulted,
-        judgement,
-        sim_time_s=(golden_ns + faulted_ns) / 1e9,
-        wall_time_s=time.perf_counter() - started,
-    )
-    return Result(scenario, golden, faulted, judgement, document)
 
 
 def rig_params(scenario: Scenario) -> RigParams:
@@ -101,27 +117,44 @@ def run_rig(
 ) -> tuple[RunRecord, int]:
     """One run from power-up to disabled drives; the record and the time simulated [ns]. Raises NotStartedError."""
     rig = build_rig(params, injectors)
-    collecting = gc.isenabled()
-    gc.disable()  # nothing in a run makes cycles of references; looking for them costs a fifth of the time
-    try:
+    with uncollected():
         drive_through(rig, progress)
-    finally:
-        if collecting:
-            gc.enable()
-    return record_of(rig), rig.loop.now
+        return record_of(rig), rig.loop.now
 
 
 def drive_through(rig: Rig, progress: Progress) -> None:
     """Run the loop until the motion time is over and the drives are left; always ends."""
+    usual_ns = rig.params.stride_ns + rig.params.duration_ns + LEAVE_NS
+    for now in chunks(rig):
+        progress(min(1.0, now / usual_ns))
+    rig.gateway.finish(rig.loop.now)
+    progress(1.0)
+
+
+@contextmanager
+def uncollected() -> Iterator[None]:
+    """No garbage collection: nothing in a run makes cycles of references, and looking costs a fifth of the time."""
+    collecting = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if collecting:
+            gc.enable()
+
+
+def chunks(rig: Rig, step_ns: int = CHUNK_NS) -> Iterator[int]:
+    """Run the loop until the motion time is over and the drives are left; always ends, on a multiple of CHUNK_NS.
+
+    Pauses every step_ns, of which CHUNK_NS is a multiple, and yields the loop's time.
+    """
     controller, loop, params = rig.controller, rig.loop, rig.params
     latest = START_NS + params.stride_ns + params.duration_ns + LEAVE_NS
     while loop.now < latest:
-        loop.run_until(loop.now + CHUNK_NS)
-        if motion_over(controller, params.duration_ns, loop.now):
-            break
-        progress(min(1.0, loop.now / (latest - START_NS)))
-    rig.gateway.finish(loop.now)
-    progress(1.0)
+        loop.run_until(loop.now + step_ns)
+        if loop.now % CHUNK_NS == 0 and motion_over(controller, params.duration_ns, loop.now):
+            return
+        yield loop.now
 
 
 def motion_over(controller: HighLevelController, duration_ns: int, now: int) -> bool:
@@ -155,16 +188,16 @@ def record_of(rig: Rig) -> RunRecord:
         np.array([sample.dq_d for sample in samples]),
         np.array([sample.tau_command for sample in samples]),
     )
-    media = (rig.controller_bus, rig.drive_bus)
+    trace = rig.loop.trace
     return RunRecord(
-        rows=rig.loop.trace,
+        rows=trace,
         time0_ns=rig.gateway.time_zero,
         duration_ns=params.duration_ns,
         truth=truth,
         commands=commands,
         activations=[one for one in rig.gateway.records if one.start_ns < end],
         activations_after=[one for one in rig.gateway.records if one.start_ns >= end],
-        buses=tuple(_stats(rig, medium) for medium in media),
+        buses=_stats(rig, trace),
         notes=[
             RigEvent((event.time_ns - zero) / 1e9, event.joint or "HLC", event.kind, event.text)
             for event in controller.events
@@ -175,16 +208,27 @@ def record_of(rig: Rig) -> RunRecord:
     )
 
 
-def _stats(rig: Rig, medium: Medium) -> BusStats:
-    """Frames that ended within the motion, and the share of it that they lasted (error frames not counted)."""
+def _stats(rig: Rig, rows: list[Transmission]) -> tuple[BusStats, ...]:
+    """Of each bus, frames that ended within the motion, and the share of it that they lasted (no error frames)."""
+    media = (rig.controller_bus, rig.drive_bus)
     start = rig.controller.time_zero
     end = start + rig.params.duration_ns
-    frames, busy_ns = 0, 0
-    for row in rig.loop.trace:
-        if row.bus == medium.index and start < row.end_ns <= end and not row.frame.flags & FLAG_ERROR:
-            frames += 1
-            busy_ns += row.frame.bits * medium.bit_ns
-    return BusStats(medium.name, frames, busy_ns / (end - start), sum(port.dropped for port in medium.ports))
+    frames, bits = [0] * len(media), [0] * len(media)
+    first = bisect_right(rows, start, key=lambda row: row.end_ns)
+    for at in range(first, bisect_right(rows, end, key=lambda row: row.end_ns)):
+        row = rows[at]
+        if not row.frame.flags & FLAG_ERROR:
+            frames[row.bus] += 1
+            bits[row.bus] += row.frame.bits
+    return tuple(
+        BusStats(
+            medium.name,
+            frames[medium.index],
+            bits[medium.index] * medium.bit_ns / (end - start),
+            sum(port.dropped for port in medium.ports),
+        )
+        for medium in media
+    )
 
 
 def _invalid_reasons(rig: Rig) -> list[str]:

@@ -18,10 +18,11 @@ from pathlib import Path
 from typing import Final
 
 from canopen_exo.bus.trace import write_candump
+from testbench.document import Summary
 from testbench.errors import BenchError
 from testbench.injections import INJECTIONS_FILE, write_injections
 from testbench.record import Array, RunRecord
-from testbench.summary import Summary, summary_json
+from testbench.summary import summary_json
 
 Writer = Callable[[Path], None]
 """Writes one file at the path given."""

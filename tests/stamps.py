@@ -1,6 +1,7 @@
-"""Kernel time stamps: a condition to wait for, because the kernel begins to stamp a moment after it was first asked to.
+"""Both clocks of a machine as a test sets them; and kernel time stamps.
 
-Until then it stamps when a message is read (net/core/dev.c, net_enable_timestamp: switched on by a work queue).
+Those are a condition to wait for: the kernel begins to stamp a moment after it was first asked to, until then it stamps
+when a message is read (net/core/dev.c, net_enable_timestamp: switched on by a work queue).
 """
 
 import socket
@@ -10,9 +11,29 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Final
 
+from canopen_exo.bus.node import SECOND
+
 _SO_TIMESTAMPNS: Final = 35
 _TIME: Final = struct.Struct("@ll")
 _LIMIT_S: Final = 20.0
+
+
+class FakeTime:
+    """Stands in for the module `time`: both clocks of the machine, ns."""
+
+    def __init__(self, monotonic: int = 1000 * SECOND) -> None:
+        self.monotonic = monotonic
+        self.wall = 1_700_000_000 * SECOND
+
+    def monotonic_ns(self) -> int:
+        return self.monotonic
+
+    def time_ns(self) -> int:
+        return self.wall
+
+    def pass_by(self, span_ns: int) -> None:
+        self.monotonic += span_ns
+        self.wall += span_ns
 
 
 @contextmanager

@@ -164,25 +164,31 @@ class PythonCanChannel(Channel):
 
     def receive(self) -> list[Arrival]:
         """What the bus holds, at most 256 messages at once; opens again what was away."""
-        now = self._stamps.begin(self.epoch_ns)
         arrivals: list[Arrival] = []
+        now = time.monotonic_ns() - self.epoch_ns
         if self._bus is None and not self._is_closed:
             self._reopen(now)
         bus = self._bus
         if bus is not None:
             self.poll_at = NEVER if self._fd >= 0 else now + _POLL_NS
-            wall = time.time_ns()
+            messages: list[can.Message] = []
+            failure: Exception | None = None
             try:
-                for count in range(_BATCH + 1):
-                    if count == _BATCH:
-                        self.poll_at = now  # the bus may hold more in itself, where select does not see it
-                        break
+                while len(messages) < _BATCH:
                     message = bus.recv(timeout=0)
                     if message is None:
                         break
-                    self._take(message, now, wall, arrivals)
+                    messages.append(message)
+                else:
+                    self.poll_at = now  # the bus may hold more in itself, where select does not see it
             except (can.CanError, OSError) as error:
-                self._lose(f"cannot read: {error}", now)
+                failure = error
+            now = self._stamps.begin(self.epoch_ns)  # not before reading: no stamp is later than now
+            wall = time.time_ns()
+            for message in messages:
+                self._take(message, wall, arrivals)
+            if failure is not None:
+                self._lose(f"cannot read: {failure}", now)
         if self._notices:
             for state in self._notices:
                 arrivals.append(Arrival(now, None, state))
@@ -233,7 +239,7 @@ class PythonCanChannel(Channel):
         self._note(ErrorState.DOWN, f"cannot send: {error}", now)
         return True
 
-    def _take(self, message: can.Message, now: int, wall: int, arrivals: list[Arrival]) -> None:
+    def _take(self, message: can.Message, wall: int, arrivals: list[Arrival]) -> None:
         stamped = int(message.timestamp * 1e9)
         stamp = self._stamps.at(stamped if abs(stamped - wall) < _WALL_CLOCK_NS else wall)
         if message.is_error_frame:

@@ -17,7 +17,8 @@ from canopen_exo.bus.node import MS, NEVER, PortState
 
 _COMPARISONS: Final = 5
 _COMPARED_WITHIN_NS: Final = 5_000
-"""A process that is interrupted between two clocks compares them again, four times at most; the closest counts."""
+"""A process that is interrupted between two clocks compares them again, four times at most; the closest counts. Where
+reading a clock takes longer than this, twice the closest so far will do."""
 
 _COMPARED_FOR_NS: Final = MS
 """How long a comparison holds: a wall clock that is being slewed drifts by 0.5 us in it (500 ppm, adjtimex(2))."""
@@ -104,7 +105,8 @@ class StampClock:
     """Stamps of CLOCK_REALTIME (the kernel's, python-can's) on the loop's clock.
 
     Both clocks are compared anew for every batch, at most once a millisecond, so a corrected wall clock does no harm: a
-    stamp lies between the one before it and now, whatever the wall clock did meanwhile.
+    stamp lies between the one before it and now, whatever the wall clock did meanwhile. `begin` comes after the
+    reading: what arrives between the two, while the process is held up, would count as earlier than it was sent.
     now: of the last `begin`; offset: what to take from a stamp, ns; last: the stamp given last. A channel that reads
     many stamps at once does what `at` does by itself.
     """
@@ -115,6 +117,7 @@ class StampClock:
         self.last: int = -NEVER
         self._epoch_ns: int = 0
         self._compare_at: int = -NEVER
+        self._closest_ns: int = 0
 
     def begin(self, epoch_ns: int) -> int:
         """Compare the clocks when it is time to; returns now on the loop's clock [ns]."""
@@ -134,8 +137,10 @@ class StampClock:
             if after - before < tightest:
                 tightest = after - before
                 self.offset = wall - (before + after) // 2 + epoch_ns
-            if tightest < _COMPARED_WITHIN_NS:
+            if tightest < _COMPARED_WITHIN_NS or tightest <= 2 * self._closest_ns:
                 break
+        if self._closest_ns == 0 or tightest < self._closest_ns:
+            self._closest_ns = tightest
         self._epoch_ns = epoch_ns
         self._compare_at = after + _COMPARED_FOR_NS
         return after

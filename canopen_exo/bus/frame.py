@@ -81,6 +81,10 @@ class Frame:
     def __hash__(self) -> int:
         return hash((self.can_id, self.data, self.flags, self.dlc))
 
+    def __deepcopy__(self, memo: dict[int, object]) -> "Frame":
+        """Itself: it never changes."""
+        return self
+
     def __reduce__(self) -> tuple[type["Frame"], tuple[int, bytes, int, int]]:
         return Frame, (self.can_id, self.data, self.flags, self.dlc)
 

@@ -277,6 +277,7 @@ class HubChannel(Channel):
                 self.poll_at = now + MS
             while True:
                 data = self._link.read()
+                now = time.monotonic_ns() - self.epoch_ns  # not before reading: no stamp is later than now
                 size = len(data)
                 used = self._take(data, now, found)
                 self._link.rest = data[used:] if used < size else b""

@@ -7,6 +7,7 @@ A frame goes to the nodes whose acceptance filter takes it (`Node.filters`). Wha
 queue of its other port here, which is what its `receive` would do.
 """
 
+import copy
 from typing import Final, final
 
 from canopen_exo.bus.frame import Frame
@@ -47,16 +48,43 @@ class Loop:
         self._frames: Final[list[Frame]] = []
         self._senders: Final[list[Port]] = []
         self._rows: Final[list[Transmission]] = []
+        self._recalled: int = 0
         self._nowhere: Final[Medium] = Medium("none", -1, SECOND)
 
     @property
     def trace(self) -> list[Transmission]:
         """Every frame that passed a bus so far, in loop order."""
         rows = self._rows
-        for at in range(len(rows), len(self._ends)):
+        for at in range(len(rows) - self._recalled, len(self._ends)):
             sender = self._senders[at]
             rows.append(Transmission(self._ends[at], sender.medium.index, self._frames[at], sender.number))
         return rows
+
+    def forget(self) -> None:
+        """Leave the trace so far to somebody else who has it, and may give it back (`resume`)."""
+        self._rows.clear()
+        self._ends.clear()
+        self._frames.clear()
+        self._senders.clear()
+        self._recalled = 0
+
+    def resume(self, rows: list[Transmission]) -> None:
+        """Of a copy that has forgotten: the trace so far. Nodes that have taken another one's place are heard."""
+        self._rows.extend(rows)
+        self._recalled = len(rows)
+        for medium in self.media:
+            self._listen(medium)
+
+    def __deepcopy__(self, memo: dict[int, object]) -> "Loop":
+        """The same state between two instants; the rows of the trace are shared."""
+        twin = Loop(copy.deepcopy(self.media, memo))
+        memo[id(self)] = twin
+        twin.nodes = copy.deepcopy(self.nodes, memo)
+        twin.outs = copy.deepcopy(self.outs, memo)
+        twin.now = self.now
+        twin._rows.extend(self.trace)
+        twin._recalled = len(twin._rows)
+        return twin
 
     def connect(self, node: Node, media: list[Medium]) -> None:
         """Add a node; its port k is attached to media[k]. Order of adding is the order of waking."""

@@ -204,25 +204,28 @@ class SocketCanChannel(RecordChannel):
 
     def receive_records(self, place: int) -> list[RecordArrival]:
         """As `receive`, undecoded."""
-        now = self._stamps.begin(self.epoch_ns)
-        found: list[RecordArrival] = []
         if self._socket is None and not self._is_closed:
-            self._reopen(now)
+            self._reopen(time.monotonic_ns() - self.epoch_ns)
+        count = 0
+        failure: OSError | None = None
         if self._socket is not None:
             try:
                 count = self._receiver.read()
-                if self._receiver.is_plain and not self._is_down:
-                    if count == 1:  # what a bus that is not crowded gives; a frame waits for this
-                        record, seconds, nanos = self._receiver.first()
-                        self._take(record, self._stamps.at(seconds * SECOND + nanos), place, found)
-                    else:
-                        self._take_plain(place, now, found)
-                else:
-                    self._take_all(place, now, found)
             except BlockingIOError:
                 pass
             except OSError as error:
-                self._fail(error, now)
+                failure = error
+        now = self._stamps.begin(self.epoch_ns)  # not before reading: no stamp is later than now
+        found: list[RecordArrival] = []
+        if count and (self._is_down or not self._receiver.is_plain):
+            self._take_all(place, now, found)
+        elif count == 1:  # what a bus that is not crowded gives; a frame waits for this
+            record, seconds, nanos = self._receiver.first()
+            self._take(record, self._stamps.at(seconds * SECOND + nanos), place, found)
+        elif count:
+            self._take_plain(place, now, found)
+        elif failure is not None:
+            self._fail(failure, now)
         if self._notices:
             self._hand_out(now, place, found)
         if self._socket is not None:

@@ -22,17 +22,41 @@ _ROW: Final = struct.Struct("<qBIBBB")
 """Time [ns] i64, bus u8, CAN id u32, flags u8, DLC on the wire u8, payload bytes u8; the payload follows."""
 
 
-def trace_hash(rows: Iterable[Transmission]) -> str:
-    """SHA-256 (hex) over time, bus, id, flags, DLC, length and data of every row, in the order given.
+class TraceHash:
+    """SHA-256 over time, bus, id, flags, DLC, length and data of every row, in the order given.
 
     Each row says how long it is, so two different traces never give the same bytes. The sender is not in it: a row is
     what anyone on the bus could have seen.
     """
-    digest = hashlib.sha256()
-    for row in rows:
-        frame = row.frame
-        data = frame.data
-        digest.update(_ROW.pack(row.end_ns, row.bus, frame.can_id, frame.flags, frame.dlc, len(data)) + data)
+
+    def __init__(self) -> None:
+        self._digest = hashlib.sha256()
+
+    def update(self, rows: Iterable[Transmission]) -> None:
+        """Further rows."""
+        pack, parts = _ROW.pack, []
+        for row in rows:
+            frame = row.frame
+            data = frame.data
+            parts.append(pack(row.end_ns, row.bus, frame.can_id, frame.flags, frame.dlc, len(data)))
+            parts.append(data)
+        self._digest.update(b"".join(parts))
+
+    def copy(self) -> "TraceHash":
+        """One that has seen the same rows, and goes its own way."""
+        twin = TraceHash()
+        twin._digest = self._digest.copy()
+        return twin
+
+    def hexdigest(self) -> str:
+        """Of the rows so far."""
+        return self._digest.hexdigest()
+
+
+def trace_hash(rows: Iterable[Transmission]) -> str:
+    """The TraceHash (hex) of a whole trace."""
+    digest = TraceHash()
+    digest.update(rows)
     return digest.hexdigest()
 
 

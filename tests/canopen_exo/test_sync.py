@@ -1,11 +1,13 @@
 """SYNC: the counter, and how a device checks and watches it (CiA 301, 7.2.5; object 1019)."""
 
+from copy import deepcopy
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from canopen_exo.bus.node import MS, NEVER
-from canopen_exo.sync import SyncConsumer, SyncProducer
+from canopen_exo.sync import SyncCadence, SyncConsumer, SyncProducer
 
 PERIOD = 2 * MS
 
@@ -141,3 +143,43 @@ def test_losses_are_the_gaps_longer_than_the_time_out(gaps: list[int]) -> None:
         losses += woken_through(consumer, now - 1)
         consumer.received(now, b"\1")
     assert losses == expected
+
+
+# --- how often it comes ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("told_ms", range(1, 21))
+@pytest.mark.parametrize("real_ms", range(1, 21))
+def test_another_rate_than_was_told_shows_within_five_seconds(told_ms: int, real_ms: int) -> None:
+    """Processes of a rig that were told different rates: any two of the rates there are."""
+    cadence = SyncCadence(told_ms * MS)
+    for now in range(7 * MS, 5_000 * MS, real_ms * MS):
+        cadence.received(now)
+    assert cadence.other_ns == (0 if told_ms == real_ms else real_ms * MS)
+    assert (f"SYNC comes every {real_ms:.2f} ms, rig.rate here says {told_ms} ms" in cadence.words()) == (
+        told_ms != real_ms
+    )
+
+
+def test_late_lost_and_missing_sync_is_no_other_rate() -> None:
+    """A machine that stands still for 150 ms, SYNC that is lost here and there, a controller that starts again."""
+    cadence = SyncCadence(2 * MS)
+    for number in range(1000):
+        if number % 100 != 50:
+            cadence.received(number * 2 * MS + (150 * MS if 200 <= number < 275 else 0))
+        assert cadence.other_ns == 0
+    for number in range(1000):
+        cadence.received(3_456 * MS + number * 2 * MS)
+        assert cadence.other_ns == 0
+
+
+def test_cadence_that_is_copied_goes_on_as_the_original() -> None:
+    """Snapshots copy it in mid-run."""
+    cadence = SyncCadence(2 * MS)
+    for number in range(50):
+        cadence.received(number * 10 * MS)
+    twin = deepcopy(cadence)
+    cadence.received(500 * MS)
+    twin.received(500 * MS)
+    assert twin.other_ns == cadence.other_ns == 10 * MS
+    assert twin.last == cadence.last == 500 * MS

@@ -20,10 +20,10 @@ from cantools.database.can import Database
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
+from testbench.document import Summary
 from testbench.run import run_scenario
 from testbench.scenario import JOINT_NAMES, load_scenario
 from testbench.store import result_files, write_result
-from testbench.summary import Summary
 
 pytestmark = pytest.mark.run
 

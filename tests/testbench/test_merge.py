@@ -9,7 +9,7 @@ from canopen_exo.bus.frame import Frame
 from canopen_exo.bus.lateness import Lateness
 from canopen_exo.bus.medium import Transmission
 from canopen_exo.bus.node import MS, NEVER
-from canopen_exo.plan import RPDO1
+from canopen_exo.plan import RPDO1, SYNC
 from fi_gateway.injector import Injector
 from fi_gateway.schema import build_injectors
 from testbench.merge import GIVEN_UP, IncompleteError, add_reasons, merge
@@ -520,6 +520,19 @@ def test_commands_of_a_foreign_controller_come_from_its_frames(
     wanted = np.clip(expected.commands.tau_command, -1000 * rated, 1000 * rated)  # the clamp is at rated torque
     assert np.all(np.abs(found.commands.tau_command - wanted) <= rated)  # per mille of rated torque on the wire
     assert np.array_equal(found.truth.q, expected.truth.q)
+
+
+def test_foreign_controller_at_another_rate_makes_a_run_invalid(
+    scenario: Scenario, expected: RunRecord, parts: Parts
+) -> None:
+    """Cycles, commands and lateness are told by the scenario's: nothing of it would be right."""
+    _, gateway, joints = parts
+    zero = expected.time0_ns
+    rows = [row for row in gateway.rows if row.frame.can_id != SYNC or round((row.end_ns - zero) / (10 * MS)) % 2 == 0]
+    found = merge(scenario.plan, expected.duration_ns, None, replace(gateway, rows=rows), joints, [])
+    said = "SYNC comes every 20.00 ms, rig.rate here says 10 ms (100 Hz); give all processes of a rig the same rig.rate"
+    assert found.invalid_reasons == [said]
+    assert merge(scenario.plan, expected.duration_ns, None, gateway, joints, []).invalid_reasons == []
 
 
 def test_foreign_controller_that_walks_to_the_end_has_completed(

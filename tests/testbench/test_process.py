@@ -9,6 +9,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, ClassVar
@@ -20,7 +21,7 @@ from can.interfaces.virtual import VirtualBus
 from canopen_exo.bus.channel import Arrival, Channel
 from canopen_exo.bus.frame import Frame
 from canopen_exo.bus.interfaces import BusName, parse_bus
-from canopen_exo.bus.node import MS, NEVER, ErrorState, Node, PortState
+from canopen_exo.bus.node import MS, NEVER, SECOND, ErrorState, Node, PortState
 from fi_gateway.control import NAMED, WORDS
 from fi_gateway.control_socket import DEFAULT_ADDRESS
 from fi_gateway.gateway import CONTROLLER_PORT, DRIVE_PORT
@@ -193,6 +194,54 @@ def test_gateway_needs_no_more_than_injectors_and_says_what_it_does(
     ]
 
 
+PER_SYNC = """\
+injectors:
+  rare:
+    target: {bus: to_controller, cob_id: 0x185}
+    fault: {type: drop}
+    event: {type: failure_probability, p: 0.001, per: sync}
+    effect: {type: once}
+"""
+
+
+@pytest.mark.parametrize(
+    ("faults", "cycle_ms", "status", "code"),
+    [(PER_SYNC, 10, False, 3), (PER_SYNC, 2, True, 0), (FAULTS, 10, True, 3), (FAULTS, 10, False, 0)],
+)
+def test_gateway_whose_faults_count_by_another_rate_than_the_controllers_says_so(
+    channels: list[DeadChannel],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    capfd: pytest.CaptureFixture[str],
+    faults: str,
+    cycle_ms: int,
+    status: bool,
+    code: int,
+) -> None:
+    """Processes told different `rig.rate`: a clear error and exit 3, where a fault hangs on the length of a cycle.
+
+    It does with `per: sync`, and with our controller, whose status frames count cycles.
+    """
+    syncs = [Arrival(at * cycle_ms * MS, Frame(0x080, b""), None) for at in range(200)]
+    syncs.insert(1, Arrival(0, Frame(0x2FF, bytes((2, 0, 0, 0, 0)) if status else b""), None))
+
+    def receive(channel: DeadChannel) -> list[Arrival]:
+        if channel.name == "hub:a":
+            signal.raise_signal(signal.SIGTERM)
+            return syncs
+        channel.poll_at = NEVER
+        return []
+
+    monkeypatch.setattr(DeadChannel, "receive", receive)
+    (tmp_path / "faults.yaml").write_text(faults)
+    begun = time.monotonic_ns() - 10 * SECOND
+    arguments = ["gateway", str(tmp_path / "faults.yaml"), "--controller-bus", "hub:a", "--drive-bus", "hub:b"]
+    assert main([*arguments, "--epoch", str(begun)]) == code
+    errors = [line for line in capfd.readouterr().err.splitlines() if "error" in line]
+    said = "gateway: error: SYNC comes every 10.00 ms, rig.rate here says 2 ms (500 Hz); give all processes of a rig"
+    assert errors == ([f"{said} the same rig.rate"] if code else [])
+
+
 def test_signal_handlers_of_the_caller_are_put_back() -> None:
     """A library call leaves the process as it was."""
     before = signal.getsignal(signal.SIGTERM)
@@ -282,9 +331,12 @@ def test_gateway_says_by_direction_what_was_lost_and_when_an_interface_was_off(
     monkeypatch.setattr(DeadChannel, "__init__", dead_with_losses(DeadChannel.__init__))
     buses = (parse_bus("virtual:controller"), parse_bus("virtual:drive"))
 
-    def serve_once(served: process.Session, control: object, server: object, can_resume: bool) -> None:
+    def serve_once(
+        served: process.Session, control: object, server: object, can_resume: bool, counts_cycles: bool
+    ) -> bool:
         turns = iter((False, True))
         served.run(lambda now: next(turns))
+        return True
 
     monkeypatch.setattr(gateway_process, "_serve", serve_once)
     assert gateway_main(faults_of(scenario), buses, ProcessOptions(), GatewayOptions()) == 0

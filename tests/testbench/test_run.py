@@ -15,11 +15,11 @@ from fi_gateway.activation import Activation
 from hlc.controller import KP
 from hlc.limits import limits_of
 from joint_emulators.models.exoskeleton import USER_75KG
+from testbench.document import Summary
 from testbench.golden import Difference, first_difference
 from testbench.record import RunRecord
 from testbench.run import run_scenario
 from testbench.scenario import Scenario, load_scenario
-from testbench.summary import Summary
 
 pytestmark = pytest.mark.run
 

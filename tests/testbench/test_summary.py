@@ -13,18 +13,11 @@ from canopen_exo.bus.node import NEVER
 from canopen_exo.bus.trace import trace_hash
 from fi_gateway.activation import Activation
 from hlc.limits import limits_of
+from testbench.document import ReplayEntry, Summary
 from testbench.errors import BenchError
 from testbench.expect import parse_expectation
 from testbench.record import RunRecord
-from testbench.summary import (
-    MOST_LINES,
-    ReplayEntry,
-    Summary,
-    check_finite,
-    summary_document,
-    summary_json,
-    summary_text,
-)
+from testbench.summary import MOST_LINES, check_finite, summary_document, summary_json, summary_text
 from testbench.verdict import judge
 
 RunMaker = Callable[..., RunRecord]

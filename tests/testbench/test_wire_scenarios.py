@@ -9,11 +9,12 @@ import pytest
 from canopen_exo.bus.frame import FLAG_ERROR
 from canopen_exo.bus.medium import Transmission
 from testbench.cli import main
+from testbench.document import InjectionEntry
 from testbench.record import RunRecord
 from testbench.rig import DRIVE_BUS
 from testbench.run import Result, run_scenario
 from testbench.scenario import Scenario, load_scenario, parse_scenario
-from testbench.summary import InjectionEntry, summary_text
+from testbench.summary import summary_text
 
 FOLDER: Final = Path(__file__).parents[2] / "scenarios" / "faults"
 

@@ -10,11 +10,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from canopen_exo.bus import adapter
+from canopen_exo.bus import channel as bus_channel
 from canopen_exo.bus.adapter import PythonCanChannel, from_message, open_python_can, to_message
 from canopen_exo.bus.frame import FLAG_BRS, FLAG_ESI, FLAG_EXTENDED, FLAG_FD, FLAG_REMOTE, Frame
 from canopen_exo.bus.node import MS, NEVER, SECOND, ErrorState, Node, Out
 from canopen_exo.bus.realtime import RealTimeLoop
 from canopen_exo.errors import CanopenExoError
+from tests.stamps import FakeTime
 
 KINDS = [
     Frame(0x123, b"\1\2"),
@@ -222,6 +225,25 @@ def test_stamp_of_the_wall_clock_is_mapped_to_the_loop_clock() -> None:
     (arrival,) = channel.receive()
     # 0.1 s each way: clocks are read one after the other on a busy machine
     assert abs(arrival.stamp_ns - (now_of(channel) - 400 * MS)) < 100 * MS
+
+
+def test_message_is_not_stamped_earlier_than_it_came(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A process held up on its way to the bus reads what came meanwhile: with its own stamp, not an older now."""
+    bus = ScriptedBus()
+    channel = opened(bus)
+    clocks = FakeTime(channel.epoch_ns)
+    monkeypatch.setattr(bus_channel, "time", clocks)
+    monkeypatch.setattr(adapter, "time", clocks)
+
+    def held_up(timeout: float | None = None) -> can.Message | None:
+        if clocks.monotonic != channel.epoch_ns:
+            return None
+        clocks.pass_by(30 * MS)
+        return can.Message(timestamp=clocks.wall / SECOND, arbitration_id=1)
+
+    monkeypatch.setattr(bus, "recv", held_up)
+    (arrival,) = channel.receive()
+    assert abs(arrival.stamp_ns - 30 * MS) < 1000  # python-can stamps with a float, whose steps are 238 ns
 
 
 @pytest.mark.parametrize("stamp", [0.0, 12.5, 4e9])

@@ -5,32 +5,15 @@ import pytest
 from canopen_exo.bus import channel
 from canopen_exo.bus.channel import StampClock
 from canopen_exo.bus.node import MS, SECOND
+from tests.stamps import FakeTime
 
 EPOCH = 1000 * SECOND
-WALL = 1_700_000_000 * SECOND
-
-
-class FakeTime:
-    """Both clocks of the machine, ns."""
-
-    def __init__(self) -> None:
-        self.monotonic = EPOCH + 5 * SECOND
-        self.wall = WALL
-
-    def monotonic_ns(self) -> int:
-        return self.monotonic
-
-    def time_ns(self) -> int:
-        return self.wall
-
-    def pass_by(self, span_ns: int) -> None:
-        self.monotonic += span_ns
-        self.wall += span_ns
+WALL = FakeTime().wall
 
 
 @pytest.fixture
 def clocks(monkeypatch: pytest.MonkeyPatch) -> FakeTime:
-    fake = FakeTime()
+    fake = FakeTime(EPOCH + 5 * SECOND)
     monkeypatch.setattr(channel, "time", fake)
     return fake
 
@@ -68,3 +51,43 @@ def test_corrected_wall_clock_is_followed(clocks: FakeTime) -> None:
     clocks.wall += 7 * SECOND
     stamps.begin(EPOCH)
     assert stamps.at(clocks.wall - MS) == 5 * SECOND + 9 * MS
+
+
+class SlowTime(FakeTime):
+    """Reading a clock takes `cost_ns`; `interrupted`: the process is held up so often, 10 ms, between two clocks."""
+
+    def __init__(self, cost_ns: int) -> None:
+        super().__init__(EPOCH)
+        self.cost_ns = cost_ns
+        self.comparisons = 0
+        self.interrupted = 0
+
+    def monotonic_ns(self) -> int:
+        self.pass_by(self.cost_ns)
+        return super().monotonic_ns()
+
+    def time_ns(self) -> int:
+        self.comparisons += 1
+        if self.interrupted:
+            self.interrupted -= 1
+            self.pass_by(10 * MS)
+        return super().time_ns()
+
+
+@pytest.mark.parametrize(("cost_ns", "first"), [(1_000, 1), (50_000, 5)])
+def test_clocks_are_compared_again_only_after_an_interruption(
+    monkeypatch: pytest.MonkeyPatch, cost_ns: int, first: int
+) -> None:
+    """Five times at most; how close two readings can come is learned with the first stamps."""
+    clocks = SlowTime(cost_ns)
+    monkeypatch.setattr(channel, "time", clocks)
+    stamps = StampClock()
+    counts = []
+    for interrupted in (0, 0, 2, 0, 9):
+        clocks.pass_by(2 * MS)
+        clocks.comparisons, clocks.interrupted = 0, interrupted
+        stamps.begin(EPOCH)
+        counts.append(clocks.comparisons)
+        if interrupted < 5:
+            assert abs(stamps.at(clocks.wall) - (clocks.monotonic - EPOCH)) <= cost_ns
+    assert counts == [first, 1, 3, 1, 5]

@@ -13,6 +13,7 @@ from typing import Protocol
 
 import pytest
 
+from canopen_exo.bus import hub_client
 from canopen_exo.bus.channel import Arrival
 from canopen_exo.bus.frame import FLAG_BRS, FLAG_EXTENDED, FLAG_FD, FLAG_REMOTE, Frame
 from canopen_exo.bus.hub_client import HubChannel, HubError
@@ -27,8 +28,9 @@ from canopen_exo.bus.hub_wire import (
     pack_text,
 )
 from canopen_exo.bus.medium import QUEUE_LENGTH
-from canopen_exo.bus.node import NEVER, SECOND, ErrorState
+from canopen_exo.bus.node import MS, NEVER, SECOND, ErrorState
 from canopen_exo.errors import CanopenExoError
+from tests.stamps import FakeTime
 
 PATIENCE_S = 20.0
 """How long a test waits for what must come; on a busy machine it only has to come at all."""
@@ -262,6 +264,25 @@ def test_stamps_of_a_hub_on_another_machine_are_moved_to_our_clock(fake_hub: Fak
         link.sendall(pack_frame(Frame(1, b""), its_now))
         (arrival,) = wait(channel, lambda found: bool(found))
         assert before <= arrival.stamp_ns <= after
+    channel.close()
+
+
+def test_frame_is_not_stamped_earlier_than_it_came(fake_hub: FakeHub, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A process held up on its way to the socket reads what came meanwhile: with the hub's stamp, not an older now."""
+    channel = HubChannel(f"{fake_hub.address}/drive")
+    with fake_hub.welcome(channel, time.monotonic_ns()) as link:
+        clocks = FakeTime(time.monotonic_ns())
+        monkeypatch.setattr(hub_client, "time", clocks)
+
+        def held_up() -> bytes:
+            clocks.pass_by(30 * MS)
+            return pack_frame(Frame(1, b""), clocks.monotonic)
+
+        monkeypatch.setattr(channel._link, "read", held_up)
+        channel._link.offset_ns = 0
+        (arrival,) = channel.receive()
+        assert arrival.stamp_ns == clocks.monotonic
+        link.close()
     channel.close()
 
 

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from canopen_exo.bus import recvmmsg
+from canopen_exo.bus import channel, recvmmsg, socketcan
 from canopen_exo.bus.adapter import to_message
 from canopen_exo.bus.frame import FLAG_BRS, FLAG_ESI, FLAG_EXTENDED, FLAG_FD, FLAG_REMOTE, Frame
 from canopen_exo.bus.node import MS, NEVER, SECOND, ErrorState
@@ -27,7 +27,7 @@ from canopen_exo.bus.socketcan import (
     open_can_socket,
     prepare_socket,
 )
-from tests.stamps import kernel_stamps
+from tests.stamps import FakeTime, kernel_stamps
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="SocketCAN is Linux's")
 
@@ -258,6 +258,26 @@ def test_stamps_of_a_batch_differ(wire: Wire) -> None:
         if len({arrival.stamp_ns for arrival in wire.channel.receive()}) > 1:
             return
     pytest.fail("for a minute all stamps of every batch were the same")
+
+
+def test_frame_is_not_stamped_earlier_than_it_came(scripted: Wire, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A process held up on its way to the socket reads what came meanwhile: with the kernel's stamp, no older now."""
+    clocks = FakeTime(scripted.channel.epoch_ns)
+    monkeypatch.setattr(channel, "time", clocks)
+    monkeypatch.setattr(socketcan, "time", clocks)
+    came: list[int] = []
+
+    def held_up(*_: int) -> tuple[bytes, list[tuple[int, int, bytes]], int, object]:
+        if len(came) == 2:
+            raise BlockingIOError
+        clocks.pass_by(30 * MS)
+        came.append(clocks.monotonic - scripted.channel.epoch_ns)
+        stamp = struct.pack("@ll", *divmod(clocks.wall, SECOND))
+        clocks.pass_by(MS)
+        return encode(FRAME), [(socket.SOL_SOCKET, 35, stamp)], 0, None  # SO_TIMESTAMPNS
+
+    monkeypatch.setattr(scripted.sockets[0], "recvmsg", held_up)
+    assert [arrival.stamp_ns for arrival in scripted.channel.receive()] == came
 
 
 def test_send_hands_the_record_over(wire: Wire) -> None:

@@ -1,0 +1,1 @@
+"""Campaigns: a scenario times a grid times seeds, run, kept, counted and shown."""

@@ -1,0 +1,99 @@
+"""docs/paper.md: its campaigns are the paper's, its tables come from stores, and lines of them come out again."""
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from testbench.campaign.execute import Workshop, make_run
+from testbench.campaign.identity import code_version
+from testbench.campaign.markdown import table_of
+from testbench.campaign.meta import Meta
+from testbench.campaign.records import Point, RunRow, Wanted
+from testbench.campaign.rules import FixedRuns
+from testbench.campaign.schema import Campaign, load_campaign
+
+ROOT = Path(__file__).resolve().parents[3]
+DOCUMENT = (ROOT / "docs" / "paper.md").read_text(encoding="utf-8")
+RECIPE = (ROOT / "Makefile").read_text(encoding="utf-8")
+FILES = sorted((ROOT / "campaigns").glob("*.yaml"))
+BLOCK = re.compile(r"<!-- campaign results/campaigns/(\S+)\.sqlite: ([^>]*?) -->\n(.*?)<!-- end -->", re.DOTALL)
+
+
+def blocks() -> Iterator[tuple[str, str, str]]:
+    for found in BLOCK.finditer(DOCUMENT):
+        yield found[1], found[2], found[3]
+
+
+def test_every_table_is_made_by_the_recipe() -> None:
+    """No result that a command in the repository does not reproduce: `make paper` makes every store that is named."""
+    made = set(re.findall(r"--out \$\$to/(\S+)\.sqlite", RECIPE))
+    assert {store for store, _, _ in blocks()} == made
+    for path in re.findall(r"run (campaigns/\S+\.yaml) --out", RECIPE):
+        assert (ROOT / path).is_file()
+
+
+def test_every_campaign_of_the_paper_can_be_run() -> None:
+    """Files, scenarios and every point are valid; experiment 1 has the paper's 20 durations, 0.5 s once."""
+    campaigns = {path.stem: load_campaign(path) for path in FILES}
+    assert set(campaigns) == {path.stem for path in FILES} == {one.name for one in campaigns.values()}
+    durations = [dict(point.parameters)["duration"] for point in campaigns["rmse_over_duration"].points]
+    assert len(durations) == len(set(durations)) == 20
+    assert {"0.05 s", "0.5 s", "0.75 s", "3 s"} <= set(durations)
+    assert campaigns["rmse_over_duration"].rule == FixedRuns(30)
+
+
+def about(campaign: Campaign, points: tuple[Point, ...]) -> Meta:
+    return Meta(
+        name=campaign.name,
+        description="",
+        file="",
+        text="",
+        store="",
+        axes=campaign.axes,
+        points=points,
+        rule=campaign.rule,
+        asked="",
+        wanted=0,
+        seed=campaign.seed,
+        figures=campaign.figures,
+    )
+
+
+def made_again(campaign: Campaign, point: Point) -> list[RunRow]:
+    """All runs of one point."""
+    assert isinstance(campaign.rule, FixedRuns)
+    workshop = Workshop()
+    wanted = [Wanted(point, number) for number in range(campaign.rule.runs)]
+    return [make_run(campaign.spec_of(one, code_version(), "", True), workshop) for one in wanted]
+
+
+@pytest.mark.run
+@pytest.mark.parametrize(
+    ("file", "value", "what"),
+    [
+        ("rmse_over_duration", "0.05 s", "values 1"),
+        ("bit_flips", "17", "outcomes"),
+        ("small_faults", "spike 2 rad", "outcomes"),
+    ],
+)
+def test_line_of_the_document_comes_out_again(file: str, value: str, what: str) -> None:
+    """Same seeds, same numbers: all runs of one point, made anew, give the line that stands in the document."""
+    campaign = load_campaign(ROOT / "campaigns" / f"{file}.yaml")
+    (point,) = (point for point in campaign.points if point.parameters[0][1] == value)
+    table = table_of(made_again(campaign, point), about(campaign, (point,)), what)
+    line = table.splitlines()[-1]
+    (written,) = (text for store, words, text in blocks() if (store, words) == (file, what))
+    columns = [heads.splitlines()[2] for heads in (table, written)]
+    assert _as_pairs(columns[0], line).items() <= _as_pairs(columns[1], _line_of(written, line)).items()
+
+
+def _line_of(table: str, line: str) -> str:
+    (found,) = (one for one in table.splitlines() if one.split("|")[:2] == line.split("|")[:2])
+    return found
+
+
+def _as_pairs(heads: str, line: str) -> dict[str, str]:
+    """Cells by head: the whole table has columns for outcomes that a single point may not show."""
+    return dict(zip(heads.split("|")[1:-1], line.split("|")[1:-1], strict=True))

@@ -1,0 +1,220 @@
+"""The loop of a campaign: what is wanted is made once, kept, found again, and asked for by nobody else."""
+
+import dataclasses
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from testbench.campaign.executor import Executor
+from testbench.campaign.records import Known, Outcome, Plan, Point, RunRow, RunSpec, Wanted
+from testbench.campaign.runner import Finished, Progress, Runner, Way
+from testbench.campaign.schema import Campaign
+from testbench.campaign.store import Store, open_store
+from tests.testbench.campaign.campaigns import small
+from tests.testbench.campaign.workers import row_of
+
+WAY = Way("v1", "folder", fork=True, jobs=2)
+
+
+class Here(Executor):
+    """Makes runs at once, the last submitted first, so that no order is the usual one."""
+
+    def __init__(self, make: Callable[[RunSpec], RunRow] = row_of, room: int = 2) -> None:
+        self.make, self.room = make, room
+        self.specs: list[RunSpec] = []
+        self.flying: list[RunSpec] = []
+        self.is_stopped = False
+
+    def free(self) -> int:
+        return self.room - len(self.flying)
+
+    def submit(self, spec: RunSpec) -> None:
+        assert self.free() > 0
+        self.specs.append(spec)
+        self.flying.append(spec)
+
+    def collect(self, timeout_s: float) -> list[RunRow]:
+        return [self.make(self.flying.pop())] if self.flying else []
+
+    def stop(self) -> None:
+        self.is_stopped = True
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[Store]:
+    made = open_store(tmp_path / "store.sqlite", write=True)
+    yield made
+    made.close()
+
+
+def run(
+    campaign: Campaign,
+    store: Store,
+    executor: Here | None = None,
+    *,
+    way: Way = WAY,
+    plan: Plan | None = None,
+    stop_after: int = 10_000,
+) -> tuple[Finished, list[RunSpec]]:
+    """Run a campaign; stop_after: Ctrl-C once so many runs were made."""
+    executor = Here() if executor is None else executor
+    told: list[Progress] = []
+    runner = Runner(campaign, store, way, plan)
+    runner.prepare()
+    finished = runner.run(executor, told.append, lambda: int(bool(told) and told[-1].made >= stop_after))
+    assert executor.is_stopped
+    return finished, executor.specs
+
+
+def rows_of(store: Store) -> list[RunRow]:
+    return [dataclasses.replace(row, wall_s=0.0) for row in store.runs.all()]
+
+
+def test_every_wanted_run_is_made_once(store: Store) -> None:
+    """Two points, three runs each, seed k = 5 + k, the duration set in both injectors."""
+    finished, specs = run(small(), store)
+    assert (finished.progress.done, finished.progress.wanted, finished.interrupted) == (6, 6, False)
+    assert len({spec.identity for spec in specs}) == 6
+    assert [(dict(row.point.parameters)["duration"], row.number, row.seed) for row in store.runs.all()] == [
+        *(("0.05 s", 0, 5), ("0.05 s", 1, 6), ("0.05 s", 2, 7)),
+        *(("0.3 s", 0, 5), ("0.3 s", 1, 6), ("0.3 s", 2, 7)),
+    ]
+    for spec in specs:
+        duration = {"0.05 s": "50 ms", "0.3 s": "0.3 s"}[dict(spec.wanted.point.parameters)["duration"]]
+        assert spec.scenario.count(f"duration: {duration}\n") == 2
+        assert f"\nseed: {spec.seed}\n" in spec.scenario
+
+
+def test_running_again_makes_nothing(store: Store) -> None:
+    """What the store has is never made again."""
+    run(small(), store)
+    before = store.runs.all()
+    finished, specs = run(small(), store)
+    assert specs == []
+    assert finished.reused == 6
+    assert store.runs.all() == before
+
+
+def test_interrupted_campaign_goes_on_and_ends_with_the_same_rows(store: Store, tmp_path: Path) -> None:
+    """Ctrl-C after some runs: runs in flight are taken in, the rest is made the next time, nothing twice."""
+    finished, first = run(small(), store, stop_after=2)
+    assert finished.interrupted
+    assert 2 <= len(store.runs.all()) < 6
+    assert store.invocations.all()[-1].how == "interrupted"
+    kept = {row.identity for row in store.runs.all()}
+    assert kept == {spec.identity for spec in first}
+    finished, second = run(small(), store)
+    assert kept.isdisjoint(spec.identity for spec in second)
+    whole = open_store(tmp_path / "whole.sqlite", write=True)
+    run(small(), whole)
+    assert rows_of(store) == rows_of(whole)
+    assert [one.how for one in store.invocations.all()] == ["interrupted", "done"]
+    whole.close()
+
+
+def test_changed_file_adds_what_is_new_and_counts_what_it_wants(store: Store) -> None:
+    """More runs, another value: made; what is no longer wanted stays and does not count."""
+    run(small(), store)
+    finished, specs = run(small(("values: [0.05 s, 0.3 s]", "values: [0.3 s, 0.5 s]"), ("runs: 3", "runs: 4")), store)
+    assert finished.reused == 3
+    assert len(specs) == 5
+    assert len(store.runs.all()) == 8
+    assert {dict(row.point.parameters)["duration"] for row in store.runs.all()} == {"0.3 s", "0.5 s"}
+    assert store.runs.others() == {"v1": 3}
+    run(small(), store)
+    assert len(store.runs.all()) == 6
+
+
+def test_runs_of_another_version_are_made_anew(store: Store) -> None:
+    """Rows of another code version stay in the store, and are never taken for this one's."""
+    run(small(), store)
+    finished, specs = run(small(), store, way=dataclasses.replace(WAY, version="v2"))
+    assert (finished.reused, len(specs)) == (0, 6)
+    assert len(store.runs.all()) == 6
+    assert store.runs.others() == {"v1": 6}
+
+
+def test_run_is_known_by_what_it_is_not_by_its_name(store: Store) -> None:
+    """An axis with another name, and a value written in another unit: the same runs, under their new names."""
+    run(small(), store)
+    units = ("values: [0.05 s, 0.3 s]", "values: [50 ms, 300 ms]")
+    renamed = small(("  duration:\n    set", "  length:\n    set"), units)
+    _, specs = run(renamed, store)
+    assert specs == []
+    assert {row.point.parameters for row in store.runs.all()} == {(("length", "50 ms"),), (("length", "300 ms"),)}
+
+
+def test_early_stop_makes_another_run() -> None:
+    """stop_early is part of a run's identity, the time limit and where traces go are not."""
+    wanted = Wanted(small().points[0], 0)
+    plain = small().identity_of(wanted, "v1")
+    stopped = {
+        small(("runs: 3", f"runs: 3\nstop_early: {{on: failure, grace: {grace}}}")).identity_of(wanted, "v1")
+        for grace in ("0.1 s", "0.2 s")
+    }
+    assert len({plain, *stopped}) == 3
+    assert small(("runs: 3", "runs: 3\ntime_limit: 5 s\ntraces: always")).identity_of(wanted, "v1") == plain
+
+
+class TwoSteps(Plan):
+    """One run; and when it is known two more at another place, if it did not fail."""
+
+    def __init__(self, points: tuple[Point, ...]) -> None:
+        self.points = points
+
+    def wanted(self, known: Known) -> list[Wanted]:
+        first = Wanted(self.points[0], 0)
+        rows = known.get(first.point, ())
+        if not rows or rows[0].outcome is not Outcome.MASKED:
+            return [first]
+        return [first, Wanted(self.points[1], 0), Wanted(self.points[1], 1)]
+
+
+def test_plan_is_asked_again_as_runs_come_in(store: Store) -> None:
+    """A search sees what came out; on resuming it wants the same."""
+    campaign = small()
+    finished, specs = run(campaign, store, plan=TwoSteps(campaign.points))
+    assert [spec.wanted.number for spec in specs] == [0, 0, 1]
+    assert finished.progress.wanted == 3
+    finished, specs = run(campaign, store, plan=TwoSteps(campaign.points))
+    assert (specs, finished.reused) == ([], 3)
+
+
+def test_rows_are_the_same_in_whatever_order_runs_finish(store: Store, tmp_path: Path) -> None:
+    """A sequential rule on one process and on seven."""
+    rule = "runs: {until: {outcome: failure, width: 0.5}, batch: 4, least: 4, most: 40}"
+    campaign = small(("runs: 3", rule))
+    run(campaign, store, Here(room=1))
+    other = open_store(tmp_path / "other.sqlite", write=True)
+    run(campaign, other, Here(room=7))
+    assert rows_of(store) == rows_of(other)
+    assert 8 < len(rows_of(store)) < 80
+    other.close()
+
+
+def test_failing_executor_keeps_what_was_made(store: Store) -> None:
+    """An error in the middle: the processes are stopped, the rows stay."""
+    made: list[RunSpec] = []
+
+    def make(spec: RunSpec) -> RunRow:
+        if len(made) == 2:
+            raise RuntimeError("power failure")
+        made.append(spec)
+        return row_of(spec)
+
+    executor = Here(make)
+    runner = Runner(small(), store, WAY)
+    runner.prepare()
+    with pytest.raises(RuntimeError, match="power failure"):
+        runner.run(executor, lambda progress: None, lambda: 0)
+    assert executor.is_stopped
+    assert len(store.runs.all()) == 2
+
+
+def test_progress_tells_rate_and_time_left() -> None:
+    """30 runs in a minute, 60 to go: 30 a minute, two minutes left; what was there before counts for no rate."""
+    progress = Progress(done=40, wanted=100, made=30, elapsed_s=60.0, counts={})
+    assert progress.per_minute == 30
+    assert progress.left_s == 120
+    assert Progress(10, 100, 0, 5.0, {}).left_s is None
