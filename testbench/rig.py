@@ -77,6 +77,7 @@ def build_rig(params: RigParams, injectors: list[Injector]) -> Rig:
     loop.connect(gateway, [controller_bus, drive_bus])
     loop.connect(rack, [drive_bus] * len(plan.joints))
     for medium in (controller_bus, drive_bus):
+        gateway.join(medium)
         _install_wire(loop, medium, injectors)
     return Rig(params, loop, controller_bus, drive_bus, master, controller, gateway, rack)
 
@@ -87,11 +88,11 @@ def _install_wire(loop: Loop, medium: Medium, injectors: list[Injector]) -> None
     if not faults:
         return
     for fault in faults:
-        fault.add_nodes(loop, medium)
+        fault.connect(loop, medium)
     wire = Wire(medium, [])
     loop.install(wire, medium)
     for fault in faults:
-        fault.attach(wire)
+        fault.install(wire)
 
 
 def build_mechanics(params: RigParams) -> str:
