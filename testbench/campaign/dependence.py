@@ -63,8 +63,9 @@ def ranking_section(rows: Sequence[RunRow], meta: Meta) -> Html | None:
     note = (
         "Explained: share of the variance of the ranks that the parameter explains, corrected for chance. "
         "Rank correlation: Spearman, its 95 % interval with the seeds as groups; it sees what "
-        "rises or falls, eta squared any difference between values. What acts only in combination is not seen. Runs "
-        "in which no fault began have no gait phase and are not in here."
+        "rises or falls, eta squared any difference between values; it is left out for a gait phase that was drawn, "
+        "which belongs to its seed alone: of that only what rises or falls over the stride is seen. What acts only in "
+        "combination is not seen. Runs in which no fault began have no gait phase and are not in here."
     )
     return tag("section", tag("h2", "What matters"), *parts, tag("p", note, class_="note"), id="ranking")
 

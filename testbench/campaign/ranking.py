@@ -39,8 +39,9 @@ class Effect:
     numeric: its values are numbers. levels: how many different ones. strength: share of the rank variance explained,
     corrected for chance, so that it is about 0 (and may be negative) for a parameter without effect, 1 for one that
     decides the order alone; the larger one of rho squared and eta squared. rho: Spearman, None for names; interval: of
-    rho, None where |rho| is 1. eta_squared: corrected, None for numbers that are all but never repeated. p_value: of no
-    dependence, of whichever strength is from; None for runs in groups. reason: why there is no strength, "" otherwise.
+    rho, None where |rho| is 1. eta_squared: corrected, None for numbers that are all but never repeated, and for
+    values of which each is found in one group alone: it would be that of the groups. p_value: of no dependence, of
+    whichever strength is from; None for runs in groups. reason: why there is no strength, "" otherwise.
     """
 
     parameter: str
@@ -107,7 +108,7 @@ def rank_parameters(
     if ys.min() == ys.max():
         raise NotEstimableError(f"the result is {ys[0]:g} in all {ys.size} runs: nothing depends on any parameter")
     blocks = _blocks(range(ys.size) if groups is None else groups)
-    effects = [_effect(name, column, ys, blocks, groups is None, confidence) for name, column in parameters.items()]
+    effects = [_effect(name, column, ys, groups, blocks, confidence) for name, column in parameters.items()]
     effects.sort(key=lambda effect: -math.inf if effect.strength is None else effect.strength, reverse=True)
     pairs = (
         Together(one, other, _explained(parameters[one], parameters[other]))
@@ -120,8 +121,8 @@ def _effect(
     name: str,
     column: Sequence[float] | Sequence[str],
     ys: Array,
+    groups: Sequence[Hashable] | None,
     blocks: IntArray,
-    independent: bool,
     confidence: float,
 ) -> Effect:
     from scipy.special import chdtrc, stdtr
@@ -143,14 +144,16 @@ def _effect(
         found.append(1 - (1 - rho * rho) * (n - 1) / (n - 2))
         t = abs(rho) * math.sqrt((n - 2) / max(1 - rho * rho, 1e-300))
         chances.append(2 * float(stdtr(n - 2, -t)))
-    if 2 * levels <= n:
+    is_of_groups = groups is not None and len(set(zip(column, groups, strict=True))) == levels
+    if 2 * levels <= n and not is_of_groups:
         between = _between(codes, ranks[:, None])
         eta_squared = 1 - (1 - between) * (n - 1) / (n - levels)
         found.append(eta_squared)
         chances.append(float(chdtrc(levels - 1, (n - 1) * between)))
     if not found:
-        return Effect(name, numeric, levels, None, reason=f"{levels} names in {n} runs: too few runs for each")
-    p_value = min(1.0, len(chances) * min(chances)) if independent else None
+        why = "each in one group (seed) alone" if is_of_groups else "too few runs for each"
+        return Effect(name, numeric, levels, None, reason=f"{levels} names in {n} runs: {why}")
+    p_value = min(1.0, len(chances) * min(chances)) if groups is None else None
     return Effect(name, numeric, levels, max(found), rho, interval, eta_squared, p_value)
 
 

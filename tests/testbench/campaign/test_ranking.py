@@ -126,6 +126,22 @@ def test_runs_that_share_seeds_widen_the_interval_and_have_no_p_value() -> None:
     assert grouped.p_value is None
 
 
+def test_what_a_seed_does_is_not_put_down_to_what_comes_with_the_seed() -> None:
+    """A phase drawn once a seed: eta squared of its values would be that of the seeds, whatever the phase does."""
+    generator = np.random.default_rng(30)
+    seeds, runs = np.repeat(np.arange(30), 20), np.tile(np.arange(20.0), 30)
+    phase, of_seed = generator.random(30), generator.normal(size=30)
+    y = of_seed[seeds] + 0.05 * runs + 0.3 * generator.normal(size=600)
+    ranking = rank_parameters({"phase": list(phase[seeds]), "run": list(runs)}, list(y), list(seeds))
+    found = effect(ranking, "phase")
+    assert found.eta_squared is None
+    assert found.strength is not None
+    assert found.strength < 0.15
+    assert effect(ranking, "run").eta_squared is not None
+    names = rank_parameters({"draw": [f"draw {seed}" for seed in seeds]}, list(y), list(seeds))
+    assert effect(names, "draw").reason == "30 names in 600 runs: each in one group (seed) alone"
+
+
 def test_parameters_that_vary_together_are_named() -> None:
     """Two copies, a name that follows a number, two names that follow each other; not what is independent."""
     generator = np.random.default_rng(28)
