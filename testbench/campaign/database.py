@@ -120,14 +120,18 @@ def open_database(path: Path, *, write: bool) -> Database:
     return Database(path, connection)
 
 
+_GO_ON: Final = "and start again, or give another place with --out; all runs written before are in it"
 _WORDS: Final = {
-    "SQLITE_FULL": "the disk is full; make room",
-    "SQLITE_READONLY": "it may not be written; change its permissions",
-    "SQLITE_CANTOPEN": "it cannot be opened; look whether its folder is there and may be written",
-    "SQLITE_NOTADB": "this is no SQLite file, and was left alone",
-    "SQLITE_BUSY": "somebody else is writing to it; end that program",
-    "SQLITE_IOERR": "the disk cannot be read or written (full, or a file-size limit reached, or broken); make room",
-    "SQLITE_CORRUPT": "the file is damaged; `sqlite3 STORE .recover` gets out what can be",
+    "SQLITE_FULL": f"the disk is full; make room {_GO_ON}",
+    "SQLITE_READONLY": f"it may not be written; change its permissions {_GO_ON}",
+    "SQLITE_CANTOPEN": "it cannot be opened; look whether its folder is there and may be written, or give another place "
+    "with --out",
+    "SQLITE_NOTADB": "this is no SQLite file, and was left alone; give another place with --out",
+    "SQLITE_BUSY": f"somebody else is writing to it; end that program {_GO_ON}",
+    "SQLITE_IOERR": "the disk cannot be read or written (full, or a file-size limit reached, or broken); make room "
+    f"{_GO_ON}",
+    "SQLITE_CORRUPT": "the file is damaged; `sqlite3 STORE .recover` gets out what can be; run into a new store with "
+    "--out",
 }
 
 
@@ -138,6 +142,5 @@ def explained(path: Path) -> Iterator[None]:
         yield
     except sqlite3.Error as error:
         name = getattr(error, "sqlite_errorname", "")
-        words = next((words for code, words in _WORDS.items() if name.startswith(code)), f"{error}")
-        remedy = "and start again, or give another place with --out; all runs written before are in it"
-        raise StoreError(f"store {path}: {words} {remedy}") from error
+        words = next((words for code, words in _WORDS.items() if name.startswith(code)), str(error))
+        raise StoreError(f"store {path}: {words}") from error

@@ -217,8 +217,9 @@ def test_what_is_no_store_is_left_alone(tmp_path: Path) -> None:
     for path, words in expected.items():
         before = None if path.is_dir() else path.read_bytes()
         for write in (False, True):
-            with pytest.raises(StoreError, match=words):
+            with pytest.raises(StoreError, match=words) as refused:
                 open_store(path, write=write)
+            assert "runs written before are in it" not in str(refused.value), "there are none"
         assert before is None or path.read_bytes() == before
     with pytest.raises(StoreError, match="no such file; `exo-hil campaign run` makes it"):
         open_store(tmp_path / "nothing.sqlite")
