@@ -124,8 +124,8 @@ _GO_ON: Final = "and start again, or give another place with --out; all runs wri
 _WORDS: Final = {
     "SQLITE_FULL": f"the disk is full; make room {_GO_ON}",
     "SQLITE_READONLY": f"it may not be written; change its permissions {_GO_ON}",
-    "SQLITE_CANTOPEN": "it cannot be opened; look whether its folder is there and may be written, or give another place "
-    "with --out",
+    "SQLITE_CANTOPEN": "it cannot be opened; look whether its folder is there and may be written, or give another "
+    "place with --out",
     "SQLITE_NOTADB": "this is no SQLite file, and was left alone; give another place with --out",
     "SQLITE_BUSY": f"somebody else is writing to it; end that program {_GO_ON}",
     "SQLITE_IOERR": "the disk cannot be read or written (full, or a file-size limit reached, or broken); make room "
