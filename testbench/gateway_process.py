@@ -183,7 +183,7 @@ def fault_main(word: str, name: str, address: str) -> int:
 def active_faults(address: str) -> list[str]:
     """Names of the injectors that act now; empty when the gateway does not say."""
     from fi_gateway.control_socket import ask_listing
-    from fi_gateway.injector import Phase
+    from fi_gateway.phase import Phase
 
     try:
         listing = ask_listing(address, timeout_s=0.1)

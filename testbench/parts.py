@@ -212,9 +212,7 @@ def read_hlc(path: Path) -> HlcPart:
     cycles = _column(path, arrays, "cycles")
     q_d, dq_d, tau = (_table(path, arrays, name, cycles.size) for name in ("q_d", "dq_d", "tau_command"))
     service = _service(notes.service)
-    return HlcPart(
-        service, notes.time_zero, notes.completed, notes.held, notes.events, cycles, q_d, dq_d, tau, rows
-    )
+    return HlcPart(service, notes.time_zero, notes.completed, notes.held, notes.events, cycles, q_d, dq_d, tau, rows)
 
 
 def read_gateway(path: Path) -> GatewayPart:

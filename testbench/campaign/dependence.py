@@ -12,9 +12,13 @@ from testbench.campaign.records import RunRow
 from testbench.campaign.rules import FAILURE
 from testbench.campaign.sections import bar
 from testbench.campaign.statistics import NotEstimableError
-from testbench.campaign.tables import share_text
+from testbench.campaign.tables import plain_share
 
 _BINS: Final = 10
+_TOGETHER: Final = (
+    "All points together; phase 0 is right heel strike. The points have the same seeds, and with drawn times a seed "
+    "has its first fault in the same phase everywhere: the number of seeds counts, so there are no intervals here."
+)
 PHASE: Final = "gait phase of the first fault"
 
 
@@ -28,16 +32,17 @@ def phase_section(rows: Sequence[RunRow]) -> Html | None:
         found = [row for phase, row in known if one.low <= phase % 1 < one.high]
         worst = f"{max(row.beyond_deg for row in found):.1f}" if found else "none"
         span = f"{100 * one.low:.0f} to {100 * one.high:.0f} %"
-        share = share_text(one.tally.successes, one.tally.trials)
-        body.append([span, str(one.tally.trials), bar(found), share, worst])
+        share = plain_share(one.tally.successes, one.tally.trials)
+        seeds = str(len({row.seed for row in found}))
+        body.append([span, str(one.tally.trials), seeds, bar(found), share, worst])
     several = sum(row.activated > 1 for _, row in known)
     note = f" In {several} of these {len(known)} runs more than one window of a fault opened." if several else ""
-    heads = ("phase", "runs", "outcomes", "failed", "worst, deg beyond")
+    heads = ("phase", "runs", "seeds", "outcomes", "failed", "worst, deg beyond")
     return tag(
         "section",
         tag("h2", "By gait phase"),
-        table("By gait phase of the first fault", heads, body, (0, 2)),
-        tag("p", f"All points together; phase 0 is right heel strike.{note}", class_="note"),
+        table("By gait phase of the first fault", heads, body, (0, 3)),
+        tag("p", f"{_TOGETHER}{note}", class_="note"),
         id="phase",
     )
 

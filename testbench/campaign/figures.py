@@ -86,7 +86,7 @@ def metric_figure(
         color=_BLACK,
         lw=1.2,
         capsize=2.5,
-        label="mean, 95 % interval",
+        label="mean, and its interval",
         zorder=4,
     )
     if curve is not None:
@@ -117,7 +117,7 @@ def share_figure(shares: Sequence[Share], paper: Marks, labels: tuple[str, str])
         color=_BLUE,
         lw=1.3,
         capsize=2.5,
-        label="share, Wilson 95 % interval",
+        label="share of the runs",
     )
     _paper(axes, [(x, 100 * y) for x, y in paper])
     axes.set_ylim(-3, 103)

@@ -17,6 +17,17 @@ EXCEEDED: Final = "exceeded"
 BEYOND_3DEG: Final = "beyond_3deg"
 """A joint beyond its range by more than 3 deg, because mechanical pins are soft."""
 
+_NAMED: Final = {
+    "beyond_deg": ("angle beyond the range of travel", "deg"),
+    "beyond_s": ("time beyond the range of travel", "s"),
+    "detection_latency_s": ("time from the first fault to the first reaction", "s"),
+    "detected_s": ("time of the first reaction", "s"),
+    "first_start_s": ("start of the first fault", "s"),
+    "first_phase": ("gait phase of the first fault", ""),
+    "failure_s": ("time of the first failure", "s"),
+    "ended_s": ("end of the motion", "s"),
+}
+"""Numbers of a run, which belong to no joint."""
 _UNITS: Final = (("_rad_s", "rad/s"), ("_rad", "rad"), ("_nm", "N m"), ("_deg", "deg"), ("_rpm", "rpm"), ("_s", "s"))
 
 
@@ -36,6 +47,8 @@ class Quantity:
 
 def quantity(name: str) -> Quantity:
     """`right_knee.rmse_position_rad` -> right knee, position RMSE, rad."""
+    if name in _NAMED:
+        return Quantity(name, *_NAMED[name])
     joint, dot, what = name.rpartition(".")
     unit, words = "", what
     for ending, found in _UNITS:
@@ -122,7 +135,11 @@ def words_of(point: Point) -> str:
     return ", ".join(f"{name} {text}" for name, text in point.parameters) or "the scenario as it is"
 
 
-def ended_early(rows: Iterable[RunRow]) -> int:
-    """Runs whose motion was cut short, so that their metrics cover less of it than those of others."""
-    ends = [row.ended_s for row in rows if row.ended_s is not None]
-    return sum(end < max(ends) - 1e-9 for end in ends)
+def motion_of(rows: Iterable[RunRow]) -> float:
+    """The longest motion that was judged [s], 0 without any: that of a run which nothing cut short."""
+    return max((row.ended_s for row in rows if row.ended_s is not None), default=0.0)
+
+
+def ended_early(rows: Iterable[RunRow], motion_s: float) -> int:
+    """Runs whose motion was shorter than that, so that their metrics cover less of it than those of others."""
+    return sum(row.ended_s is not None and row.ended_s < motion_s - 1e-9 for row in rows)

@@ -7,7 +7,7 @@ units beside the same paper's numbers; where there are too many, all are taken t
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from testbench.campaign.axes import Axis
 from testbench.campaign.figures import (
@@ -23,7 +23,9 @@ from testbench.campaign.markup import Html, table, tag
 from testbench.campaign.measured import (
     by_point,
     count,
+    ended_early,
     is_share,
+    motion_of,
     number_at,
     quantity,
     stating,
@@ -33,9 +35,11 @@ from testbench.campaign.meta import Meta
 from testbench.campaign.records import RunRow
 from testbench.campaign.rules import Figure
 from testbench.campaign.samples import Summary, mean_interval, summary
-from testbench.campaign.sections import motion_note
 from testbench.campaign.statistics import Interval, NotEstimableError, wilson
 from testbench.campaign.tables import Table, number
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as DrawnFigure
 
 _MOST_PANELS: Final = 6
 _CURVE_POINTS: Final = 60
@@ -43,17 +47,24 @@ _LEAST_FOR_FIT: Final = 4
 """Places on x; through three a parabola always goes."""
 _APART: Final = 0.3
 """Of the least distance of two x: how far to either side dots stand."""
+_NO_INTERVALS: Final = " Without intervals: runs with the same seeds are taken together, and depend on each other."
 _GOLDEN_RATIO: Final = 0.618034
 """Its multiples, modulo 1, lie far apart."""
 
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """A figure wanted, for one combination of the other axes (`held`, in words), with its runs by rising x."""
+    """A figure wanted, for one combination of the other axes (`held`, in words), with its runs by rising x.
+
+    motion_s: of a run that nothing cut short. together: for all combinations instead; runs at one x then share seeds
+    and depend on each other, so that there are no intervals.
+    """
 
     wanted: Figure
     axis: Axis
     held: str
+    together: bool
+    motion_s: float
     columns: tuple[tuple[float, tuple[RunRow, ...]], ...]
 
     @property
@@ -73,6 +84,7 @@ def panels(rows: Sequence[RunRow], meta: Meta) -> list[Panel]:
 
 
 def _panels(rows: Sequence[RunRow], meta: Meta, wanted: Figure) -> Iterator[Panel]:
+    motion_s = motion_of(rows)
     (axis,) = (axis for axis in meta.axes if axis.name == wanted.x)
     inside: dict[tuple[tuple[str, str], ...], dict[float, list[RunRow]]] = {}
     for point, found in by_point(rows, meta.points).items():
@@ -81,19 +93,20 @@ def _panels(rows: Sequence[RunRow], meta: Meta, wanted: Figure) -> Iterator[Pane
             held = tuple(pair for pair in point.parameters if pair[0] != axis.name)
             inside.setdefault(held, {}).setdefault(x, []).extend(found)
     if len(inside) > _MOST_PANELS:
-        together: dict[float, list[RunRow]] = {}
+        pooled: dict[float, list[RunRow]] = {}
         for columns in inside.values():
             for x, found in columns.items():
-                together.setdefault(x, []).extend(found)
+                pooled.setdefault(x, []).extend(found)
         names = " and ".join(one.name for one in meta.axes if one is not axis)
-        yield _panel(wanted, axis, f"all values of {names} together", together)
+        yield Panel(wanted, axis, f"all values of {names} together", True, motion_s, _by_x(pooled))
         return
     for held, columns in inside.items():
-        yield _panel(wanted, axis, ", ".join(f"{name} {text}" for name, text in held), columns)
+        words = ", ".join(f"{name} {text}" for name, text in held)
+        yield Panel(wanted, axis, words, False, motion_s, _by_x(columns))
 
 
-def _panel(wanted: Figure, axis: Axis, held: str, columns: dict[float, list[RunRow]]) -> Panel:
-    return Panel(wanted, axis, held, tuple((x, tuple(columns[x])) for x in sorted(columns)))
+def _by_x(columns: dict[float, list[RunRow]]) -> tuple[tuple[float, tuple[RunRow, ...]], ...]:
+    return tuple((x, tuple(columns[x])) for x in sorted(columns))
 
 
 def figure_section(rows: Sequence[RunRow], meta: Meta) -> tuple[Html | None, int]:
@@ -106,32 +119,44 @@ def figure_section(rows: Sequence[RunRow], meta: Meta) -> tuple[Html | None, int
 
 
 def _figure(panel: Panel, k: int) -> Html | None:
-    y = panel.wanted.y
-    title = panel_title(panel)
-    if is_share(y):
-        shares = []
-        for x, rows in panel.columns:
-            if rows:
-                part = count(rows, y)
-                interval = wilson(part, len(rows))
-                shares.append(Share(x, part / len(rows), interval.low, interval.high))
-        if not shares:
-            return None
-        figure = share_figure(shares, panel.wanted.paper, (panel.x_label, f"{y.replace('_', ' ')} [% of runs]"))
-        said = f"Share of {len(panel.rows)} runs, with its Wilson interval at 95 %."
-    else:
-        described = described_columns(panel)
-        if not described:
-            return None
-        dots = _dots(panel)
-        fits = fits_of(panel)
-        labels = (panel.x_label, quantity(y).label)
-        figure = metric_figure(dots, [_column(one) for one in described], _curve(fits), panel.wanted.paper, labels)
-        said = f"{len(dots)} runs, each a dot.{_fit_words(fits)}{motion_note(panel.rows)}"
-    text = " ".join(f"{x:g}: {y:g};" for x, y in panel.wanted.paper)
-    description = f"{said} The numbers are in the tables below." + (f" The paper: {text}" if text else "")
+    """One figure with its caption; None without a run that has a number for it."""
+    drawn = _of_shares(panel) if is_share(panel.wanted.y) else _of_metric(panel)
+    if drawn is None:
+        return None
+    figure, said = drawn
+    said += _NO_INTERVALS if panel.together else ""
+    title, paper = panel_title(panel), "; ".join(f"{x:g}: {y:g}" for x, y in panel.wanted.paper)
+    description = f"{said} The numbers are in the tables below." + (f" The paper: {paper}." if paper else "")
     svg = inline_svg(figure, k, title, description)
     return tag("figure", svg, tag("figcaption", tag("b", f"Figure {k}. {title}. "), said))
+
+
+def _of_shares(panel: Panel) -> tuple["DrawnFigure", str] | None:
+    """(figure, what is said below it)."""
+    y, shares = panel.wanted.y, []
+    for x, rows in panel.columns:
+        if rows:
+            part = count(rows, y)
+            share, interval = part / len(rows), wilson(part, len(rows))
+            low, high = (share, share) if panel.together else (interval.low, interval.high)
+            shares.append(Share(x, share, low, high))
+    if not shares:
+        return None
+    labels = (panel.x_label, f"{y.replace('_', ' ')} [% of runs]")
+    interval_words = "" if panel.together else ", with its Wilson interval at 95 %"
+    return share_figure(shares, panel.wanted.paper, labels), f"Share of {len(panel.rows)} runs{interval_words}."
+
+
+def _of_metric(panel: Panel) -> tuple["DrawnFigure", str] | None:
+    """(figure, what is said below it)."""
+    described = described_columns(panel)
+    if not described:
+        return None
+    dots, fits = _dots(panel), fits_of(panel)
+    labels = (panel.x_label, quantity(panel.wanted.y).label)
+    columns = [_column(one) for one in described]
+    figure = metric_figure(dots, columns, _curve(fits), panel.wanted.paper, labels)
+    return figure, f"{len(dots)} runs, each a dot.{_fit_words(fits)}{_cut_words(panel)}"
 
 
 def _dots(panel: Panel) -> list[tuple[float, float]]:
@@ -155,7 +180,7 @@ def panel_title(panel: Panel) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Described:
-    """The values of y at one x. mean: the interval of the mean, None for one value, or where all are equal."""
+    """The values of y at one x. mean: interval of the mean, None for one value, for equal ones, for dependent runs."""
 
     x: float
     values: Summary
@@ -165,7 +190,11 @@ class Described:
 def described_columns(panel: Panel) -> list[Described]:
     """What is said about the values at every x with runs that have one."""
     found = ((x, values_of(rows, panel.wanted.y)) for x, rows in panel.columns)
-    return [Described(x, summary(values), _mean_interval(values)) for x, values in found if values]
+    return [
+        Described(x, summary(values), None if panel.together else _mean_interval(values))
+        for x, values in found
+        if values
+    ]
 
 
 def _mean_interval(values: Sequence[float]) -> Interval | None:
@@ -205,7 +234,10 @@ def values_section(rows: Sequence[RunRow], meta: Meta) -> Html | None:
     tables = [table(one.caption, one.heads, one.body, one.texts) for one in values_tables(rows, meta)]
     if not tables:
         return None
-    note = "Mean with its 95 % interval; quartiles: a quarter of the runs below the first, a quarter above the second."
+    note = (
+        "Mean with its 95 % interval (Student's t); quartiles: a quarter of the runs below the first, a quarter above "
+        "the second. Behind a published number stands whether it is inside the interval of our mean, below or above it."
+    )
     heading = tag("h2", "Numbers of the figures")
     return tag("section", heading, *tables, tag("p", note, class_="note"), id="values")
 
@@ -231,10 +263,17 @@ def _values_table(panel: Panel, described: Sequence[Described]) -> Table:
             number(found.low),
             number(found.high),
         ]
-        body.append((*cells, *([f"{paper[one.x]:g}" if one.x in paper else ""] if paper else [])))
+        body.append((*cells, *([_beside(paper.get(one.x), one.mean)] if paper else [])))
     unit = quantity(panel.wanted.y).unit
     caption = f"{panel_title(panel)}{f', in {unit}' if unit else ''}"
     return Table(caption, (*heads, *(["the paper"] if paper else [])), tuple(body), frozenset())
+
+
+def _beside(paper: float | None, ours: Interval | None) -> str:
+    """A published number, and where it lies beside the interval of our mean."""
+    if paper is None or ours is None:
+        return "" if paper is None else f"{paper:g}"
+    return f"{paper:g} ({'below' if paper < ours.low else 'above' if paper > ours.high else 'inside'})"
 
 
 def _ends(interval: Interval | None) -> str:
@@ -253,6 +292,15 @@ def _curve(fits: Fits | None) -> Curve | None:
     fit = fits.runs
     steps = [fit.low + (fit.high - fit.low) * k / _CURVE_POINTS for k in range(_CURVE_POINTS + 1)]
     return Curve(steps, [fit.at(x) for x in steps])
+
+
+def _cut_words(panel: Panel) -> str:
+    """What has to be said under numbers of runs that were cut short, "" for none."""
+    early = ended_early(panel.rows, panel.motion_s)
+    if not early:
+        return ""
+    subject, their = ("1 run", "its") if early == 1 else (f"{early} runs", "their")
+    return f" {subject} ended early: {their} numbers cover a part of the motion."
 
 
 def _fit_words(fits: Fits | None) -> str:

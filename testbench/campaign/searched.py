@@ -1,15 +1,16 @@
-"""The part of a report that says what a search has found: a map of critical values over the other axes, and a table."""
+"""The part of a report that says what a search has found: critical values as a map and a table, or failing sets."""
 
 from collections.abc import Sequence
 from typing import Final
 
+from testbench.campaign.combinations import CombinationPlan, CombinationResult
 from testbench.campaign.critical import Answer, CriticalPlan, CriticalResult
 from testbench.campaign.figures import inline_svg, map_figure
 from testbench.campaign.markup import Content, Html, table, tag
 from testbench.campaign.measured import by_point
 from testbench.campaign.meta import Meta
 from testbench.campaign.records import Point, RunRow
-from testbench.campaign.search import CriticalSearch
+from testbench.campaign.search import CombinationSearch, CriticalSearch
 from testbench.campaign.tables import Table
 
 _ZOOM: Final = 115
@@ -27,11 +28,15 @@ def critical_results(rows: Sequence[RunRow], meta: Meta) -> tuple[CriticalResult
 
 def search_section(rows: Sequence[RunRow], meta: Meta, figure: int) -> Html | None:
     """None without a search. figure: number of its figure on the page."""
+    if isinstance(meta.rule, CombinationSearch):
+        return _combinations(CombinationPlan(meta.rule, meta.points).results(by_point(rows)))
     results = critical_results(rows, meta)
-    if not results or not isinstance(meta.rule, CriticalSearch):
-        return None
-    search = meta.rule
-    others = [axis.name for axis in meta.axes if axis.name != search.axis]
+    return _critical(results, figure) if results else None
+
+
+def _critical(results: Sequence[CriticalResult], figure: int) -> Html:
+    search = results[0].search
+    others = [name for name, _ in results[0].point.parameters]
     quantile, confidence = f"{100 * search.quantile:g} %", f"{100 * search.confidence:g} %"
     said = (
         f"The {search.axis} at which {quantile} of the runs show {search.outcome}, by {search.method}, to "
@@ -66,6 +71,41 @@ def critical_table(results: Sequence[CriticalResult]) -> Table:
         for one in results
     ]
     return Table(f"Critical {axis}", heads, tuple(body), frozenset({*range(len(others) + 2), len(heads) - 1}))
+
+
+def _combinations(results: Sequence[CombinationResult]) -> Html:
+    """Which smallest sets of injectors bring the outcome about."""
+    search = results[0].search
+    said = (
+        f"Which smallest sets of {', '.join(search.injectors)} lead to {search.outcome}: in at least {search.least} of "
+        f"{search.runs} runs, the others switched off, up to {search.most} together. Sets with a failing subset are "
+        "left out. In brackets the Clopper-Pearson interval of the share at 95 %."
+    )
+    parts = [part for one in results for part in (_sets_table(one), tag("p", _minimal_words(one), class_="note"))]
+    return tag("section", tag("h2", "Combinations of injectors"), tag("p", said), *parts, id="search")
+
+
+def _sets_table(result: CombinationResult) -> Html:
+    held = ", ".join(f"{name} {text}" for name, text in result.point.parameters)
+    body = [
+        (
+            " + ".join(one.injectors) or "none",
+            one.verdict.value,
+            "minimal" if one.minimal else "",
+            f"{one.tally.successes} of {one.tally.trials}",
+            "" if one.interval is None else f"{100 * one.interval.low:.1f} to {100 * one.interval.high:.1f} %",
+            str(one.tally.excluded),
+        )
+        for one in result.sets
+    ]
+    caption = f"Sets of injectors{', ' if held else ''}{held}"
+    return table(caption, ("set", "answer", "", "runs with the outcome", "share", "left out"), body, (0, 1, 2))
+
+
+def _minimal_words(result: CombinationResult) -> str:
+    found = "; ".join(" + ".join(names) for names in result.minimal) or "none"
+    rest = "" if result.complete else f" Unfinished: sets of up to {max(result.size, 0)} are judged."
+    return f"Smallest failing sets: {found}. {result.pruned} sets were left out, as a subset fails.{rest}"
 
 
 def _map(results: Sequence[CriticalResult], others: Sequence[str], figure: int) -> Html:

@@ -5,12 +5,12 @@ from collections.abc import Mapping, Sequence
 from typing import Final
 
 from testbench.campaign.markup import Content, Html, table, tag
-from testbench.campaign.measured import EXCEEDED, by_point, count, ended_early, is_search, points_of, stating, words_of
+from testbench.campaign.measured import EXCEEDED, by_point, count, is_search, points_of, stating, words_of
 from testbench.campaign.meta import Meta
 from testbench.campaign.notable import Notable, latest_noticed, odd, replay_command, slowest, worst
 from testbench.campaign.records import NO_STATEMENT, Outcome, RunRow
 from testbench.campaign.rules import FAILURE
-from testbench.campaign.tables import outcome_table, share_text, words
+from testbench.campaign.tables import outcome_table, plain_share, words
 
 _MOST_ROWS: Final = 240
 
@@ -32,8 +32,9 @@ def headline(rows: Sequence[RunRow], meta: Meta) -> Html:
     judged = stating(rows)
     mute = Counter(row.outcome for row in rows if row.outcome in NO_STATEMENT)
     missing = meta.wanted - len(rows)
+    where = "" if is_search(meta) else f", at {len(meta.points)} point{_s(len(meta.points))}"
     lines: list[str] = [
-        f"{meta.asked}, at {len(meta.points)} point{_s(len(meta.points))}: {len(rows)} runs made",
+        f"{meta.asked}{where}: {len(rows)} runs made",
         f", {missing} of {meta.wanted} still missing. " if missing > 0 else ". ",
     ]
     if mute:
@@ -44,7 +45,7 @@ def headline(rows: Sequence[RunRow], meta: Meta) -> Html:
     over = (
         "; a search looks where it expects to learn most, so that this is no share of anything"
         if is_search(meta)
-        else f": {share_text(failing, len(judged))} over all points together"
+        else f", {plain_share(failing, len(judged))} over all points together"
     )
     summary = tag(
         "p",
@@ -62,13 +63,13 @@ def headline(rows: Sequence[RunRow], meta: Meta) -> Html:
 
 
 def _share_of_all(outcome: Outcome, found: int, judged: int) -> str:
-    return "no statement" if outcome in NO_STATEMENT else share_text(found, judged)
+    return "no statement" if outcome in NO_STATEMENT else plain_share(found, judged)
 
 
 def outcome_section(rows: Sequence[RunRow], meta: Meta) -> Html:
     """Outcomes by point, each with a bar."""
     counted = outcome_table(rows, meta)
-    at = len(meta.axes) + 1
+    at = next(column for column in range(len(counted.heads)) if column not in counted.texts) + 1  # behind the runs
     runs = list(by_point(rows, points_of(rows, meta)).values())
     body: list[list[Content]] = [
         [*cells[:at], bar(stating(found)), *cells[at:]]
@@ -111,16 +112,6 @@ def _notable(one: Notable, store: str) -> Html:
     row = one.row
     where = f"{words_of(row.point)}; run {row.number}, seed {row.seed}; {words(row.outcome)}"
     return tag("li", tag("strong", one.why), f": {where}", tag("br"), tag("code", replay_command(store, row)))
-
-
-def motion_note(rows: Sequence[RunRow]) -> str:
-    """What has to be said under numbers of runs that were cut short, "" for none."""
-    early = ended_early(rows)
-    if not early:
-        return ""
-    return (
-        f" {early} run{_s(early)} ended early: {'its' if early == 1 else 'their'} numbers cover a part of the motion."
-    )
 
 
 def bar(rows: Sequence[RunRow]) -> Html:

@@ -39,7 +39,7 @@ def outcome_table(rows: Sequence[RunRow], meta: Meta) -> Table:
     seen = [outcome for outcome in Outcome if any(row.outcome is outcome for row in rows)]
     judged_seen = [outcome for outcome in seen if outcome not in NO_STATEMENT]
     mute = bool(set(seen) & NO_STATEMENT)
-    axes = [axis.name for axis in meta.axes]
+    axes = list(dict.fromkeys(name for point in runs for name, _ in point.parameters))
     body = []
     for point, found in runs.items():
         judged, values = stating(found), dict(point.parameters)
@@ -65,6 +65,11 @@ def share_text(part: int, whole: int) -> str:
         return "none"
     interval = wilson(part, whole)
     return f"{_percent(part / whole)} % ({_percent(interval.low)} to {_percent(interval.high)} %)"
+
+
+def plain_share(part: int, whole: int) -> str:
+    """Without interval, for points taken together: with the same seeds, their runs depend on each other."""
+    return f"{100 * part / whole:.1f} %" if whole else "none"
 
 
 def words(outcome: Outcome) -> str:

@@ -84,7 +84,7 @@ def test_same_data_give_the_same_bytes() -> None:
 def test_everything_that_is_drawn_is_in_the_legend() -> None:
     """Single runs, their middle half, mean, median, fit and the paper's numbers, with their values."""
     text = svg()
-    for words in ("single runs", "middle half of the runs", "median", "mean, 95 % interval", "quadratic fit", "paper"):
+    for words in ("single runs", "middle half", "median", "mean, and its interval", "quadratic fit", "paper"):
         assert words in text
     assert ">2.5<" in text.replace("\n", "")
 

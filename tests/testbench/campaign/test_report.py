@@ -126,7 +126,15 @@ def test_numbers_of_a_figure_stand_beside_the_papers() -> None:
     about = meta([axis("duration", "0.1 s")], points, [figure(paper=((0.1, 2.5),))])
     html = html_text(rows, about)
     cells = re.findall(r"<t[dh][^>]*>(.*?)</t[dh]>", html[html.index('id="values"') :].split("</section>")[0])
-    assert cells[8:] == ["0.1", "3", "3 (-3.57 to 9.57)", "2", "1.5, 4", "1", "6", "2.5"]
+    assert cells[8:] == ["0.1", "3", "3 (-3.57 to 9.57)", "2", "1.5, 4", "1", "6", "2.5 (inside)"]
+
+
+@pytest.mark.parametrize(("paper", "said"), [(-3.6, "below"), (-3.5, "inside"), (9.5, "inside"), (9.6, "above")])
+def test_published_number_is_said_to_be_inside_or_not(paper: float, said: str) -> None:
+    """Against the interval of our mean, -3.57 to 9.57 for 1, 2, 6; so no reader has to compare digits."""
+    points, rows = over_duration(["0.1 s"], {"0.1 s": [1, 6, 2]})
+    about = meta([axis("duration", "0.1 s")], points, [figure(paper=((0.1, paper),))])
+    assert f">{paper:g} ({said})<" in html_text(rows, about)
 
 
 def test_part_of_an_axis_is_shown_and_fitted_alone() -> None:
@@ -144,7 +152,8 @@ def test_shares_leave_out_what_makes_no_statement_and_say_so() -> None:
     rows = [row(at, k, outcome) for k, outcome in enumerate(outcomes)]
     said = words(rows, meta([axis("duration", "0.1 s")], [at], wanted=4))
     assert "4 runs made. 1 of them makes no statement (1 hang) and is in no share below." in said
-    assert "1 of 3 runs failed: 33.3 % (6.1 to 79.2 %)" in said
+    assert "1 of 3 runs failed, 33.3 % over all points together." in said
+    assert "33.3 % (6.1 to 79.2 %)" in said
     assert "In 2 runs a limit of torque, speed or angle was exceeded." in said
 
 
@@ -186,7 +195,10 @@ def test_too_many_combinations_are_taken_together_and_the_figure_says_so() -> No
         points += more
         rows += made
     said = words(rows, meta([axis("duration", "0.1 s"), axis("phase", *phases)], points, [figure()]))
-    assert "over duration, all values of phase together. 7 runs, each a dot." in said
+    assert (
+        "over duration, all values of phase together. 7 runs, each a dot. Without intervals: runs with the same seeds"
+        in said
+    )
 
 
 def test_runs_are_counted_by_the_phase_of_their_first_fault() -> None:
@@ -199,8 +211,9 @@ def test_runs_are_counted_by_the_phase_of_their_first_fault() -> None:
         row(at, 3, Outcome.NOT_ACTIVATED, first_phase=None),
     ]
     said = words(rows, meta([axis("duration", "0.1 s")], [at]))
-    assert "90 to 100 %250.0 % (9.5 to 90.5 %)12.5" in said
-    assert "0 to 10 %10 % (0 to 79.3 %)0.0" in said
+    assert "90 to 100 %2250.0 %12.5" in said  # 2 runs of 2 seeds
+    assert "0 to 10 %110.0 %0.0" in said
+    assert "there are no intervals here" in said
     assert "In 1 of these 3 runs more than one window of a fault opened." in said
 
 

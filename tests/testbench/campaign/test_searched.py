@@ -2,11 +2,12 @@
 
 from decimal import Decimal
 
+from testbench.campaign.combinations import CombinationPlan
 from testbench.campaign.critical import CriticalPlan
 from testbench.campaign.meta import Meta
 from testbench.campaign.records import Outcome, Point, RunRow
 from testbench.campaign.report import html_text
-from testbench.campaign.search import CriticalSearch
+from testbench.campaign.search import CombinationSearch, CriticalSearch
 from testbench.campaign.searched import critical_results, critical_table, search_section
 from tests.testbench.campaign.made_rows import axis, meta, point, row
 from tests.testbench.campaign.test_report import Page
@@ -71,3 +72,20 @@ def test_campaign_without_a_search_has_no_such_part() -> None:
     """A grid is no search."""
     about = meta([axis("duration", "0.1 s")], [point(duration="0.1 s")])
     assert search_section([], about, 1) is None
+
+
+def test_smallest_failing_sets_are_named() -> None:
+    """b alone fails, a and c only together: both sets are minimal, and nothing larger was tried."""
+    search = CombinationSearch(("a", "b", "c"), runs=5, most=3)
+    plan = CombinationPlan(search)
+    known: dict[Point, list[RunRow]] = {}
+    while len(found := plan.wanted(known)) > sum(map(len, known.values())):
+        known = {}
+        for one in found:
+            on = {name.split(".")[1] for name, text in one.point.parameters if text == "true"}
+            outcome = Outcome.FAILURE_SILENT if "b" in on or {"a", "c"} <= on else Outcome.MASKED
+            known.setdefault(one.point, []).append(row(one.point, one.number, outcome))
+    rows = [one for runs in known.values() for one in runs]
+    said = " ".join(Page(html_text(rows, meta([], [Point(())], rule=search))).said.split())
+    assert "Smallest failing sets: b; a + c." in said
+    assert "a + cfailsminimal5 of 5" in said
