@@ -376,7 +376,7 @@ def test_gateway_says_by_direction_what_was_lost_and_when_an_interface_was_off(
     buses = (parse_bus("virtual:controller"), parse_bus("virtual:drive"))
 
     def serve_once(
-        served: process.Session, control: object, server: object, can_resume: bool, counts_cycles: bool
+        served: process.Session, control: object, server: object, can_resume: bool, additions: object
     ) -> bool:
         turns = iter((False, True))
         served.run(lambda now: next(turns))
