@@ -107,9 +107,7 @@ def ready_made(bus: can.BusABC, interface: str, frames: int) -> tuple[socket.soc
         # the raw link under the python-can class: reached into on purpose, to time forwarding alone
         link = socket.socket(fileno=os.dup(bus._link.fileno()))  # type: ignore[attr-defined]
         link.setblocking(True)
-        return link, b"".join(
-            pack_frame(Frame(0x181, number.to_bytes(8, "little"))) for number in range(frames)
-        )
+        return link, b"".join(pack_frame(Frame(0x181, number.to_bytes(8, "little"))) for number in range(frames))
     # as above, for the other side of the comparison
     websocket = bus.remote_protocol._ws  # type: ignore[attr-defined]
     link, recorder = websocket.socket, Recorder()

@@ -35,7 +35,8 @@ def measure(hertz: int, duration_s: float) -> dict[str, Any] | str:
     try:
         document: dict[str, Any] = json.loads(done.stdout)
     except json.JSONDecodeError:
-        return done.stderr.strip()[-400:] or f"exit code {done.returncode}"
+        lines = done.stderr.strip().splitlines()
+        return (lines[-1][:400] if lines else "") or f"exit code {done.returncode}"
     return document
 
 
@@ -74,7 +75,7 @@ def main() -> int:
     for text in options.rates.split(","):
         found = measure(int(text), options.duration)
         if isinstance(found, str):
-            print(f"{text} Hz: no result: {found}", flush=True)
+            print(f"{text} Hz: INVALID: it gave nothing to judge: {found}", flush=True)
         else:
             print_run(int(text), found)
             sys.stdout.flush()

@@ -1,6 +1,6 @@
 """Millions of frames of every kind through the gateway, both ways at once: none lost, doubled, changed or out of order.
 
-The gateway runs in a process of its own, as it does on SocketCAN (bench_gateway has how), with one rule that is active
+The gateway runs in a process of its own, as it does on SocketCAN (`forwarders` has how), with one rule that is active
 all the time and changes one COB-ID in one direction only. Every record that comes out is compared, byte for byte, with
 the one that is due. Then the same, a tenth as many, with buses on the way out that are busy again and again, so that
 frames wait in the gateway: they leave in the order in which they came. Then the full bus: 9009 frames a second.
@@ -18,7 +18,8 @@ import time
 from collections import deque
 from typing import Final
 
-from benchmarks.bench_gateway import BUSY_GATEWAY, GATEWAY, PATIENCE_S, Bench, forwarding, print_full_bus, record
+from benchmarks.bench_gateway import print_full_bus
+from benchmarks.forwarders import BUSY_GATEWAY, GATEWAY, PATIENCE_S, Bench, forwarding, record
 from canopen_exo.bus.socketcan import FD_SIZE
 from canopen_exo.plan import TPDO1
 
@@ -27,7 +28,7 @@ WINDOW: Final = 40
 
 BIASED: Final = TPDO1 + 5
 BIAS: Final = 100
-"""The rule of bench_gateway: position of the right knee, bytes 0..3, towards the controller."""
+"""The rule of `forwarders`: position of the right knee, bytes 0..3, towards the controller."""
 
 EXTENDED, REMOTE, FDF = 0x80000000, 0x40000000, 4
 FD_LENGTHS: Final = (12, 16, 20, 24, 32, 48, 64)

@@ -116,12 +116,16 @@ class Device(Node):
         if frame.flags and frame.flags & (FLAG_EXTENDED | FLAG_REMOTE | FLAG_FD):
             return
         can_id, data = frame.can_id, frame.data
-        if can_id == SYNC:
-            self.synchronise(now, data, out)
-            return
         rpdo = self.rpdo_by_id.get(can_id)
         if rpdo is not None:
-            self._process_data(now, rpdo, data, out)
+            if not rpdo.is_steady or len(data) != rpdo.size or self.emcy.active or not rpdo.synchronous:
+                self._process_data(now, rpdo, data, out)
+            else:  # as nearly always
+                rpdo.pending = data
+                rpdo.last = now
+            return
+        if can_id == SYNC:
+            self.synchronise(now, data, out)
             return
         self.now = now
         if self.nmt.state is NmtState.INITIALISING:
@@ -154,11 +158,15 @@ class Device(Node):
         if not self.operational:
             return
         consumer = self.sync_consumer
-        if not consumer.received(now, data):
+        if consumer.is_steady and len(data) == consumer.size:
+            consumer.last = now
+        elif not consumer.received(now, data):
             self.emcy.occur(SYNC_LENGTH, COMMUNICATION_BIT)
             self._send_emcy(now, out)
             self._plan_wake()
             return
+        elif consumer.deadline < self.wake_at:
+            self.wake_at = consumer.deadline
         if self.emcy.active:
             self.emcy.vanish(SYNC_LENGTH)
             self.emcy.vanish(SYNC_LOST)
@@ -178,8 +186,6 @@ class Device(Node):
         for tpdo in self.tpdos:
             if tpdo.always or tpdo.on_sync(counter):
                 out.send(self.port, tpdo.frame(values))
-        if consumer.deadline < self.wake_at:
-            self.wake_at = consumer.deadline
 
     def _process_data(self, now: int, rpdo: ReceivePdo, data: bytes, out: Out) -> None:
         """An RPDO came."""

@@ -51,6 +51,14 @@ ACCESS: Final = ("ro", "rw", "wo", "const", "rww", "rwr")
 
 _HISTORY: Final = 0x1003
 
+_KEYS: Final[dict[int, int]] = {}
+
+
+def key_of(index: int, sub: int) -> int:
+    """The key of an object, index << 8 | sub. Equal keys are one integer: a dictionary finds it without comparing."""
+    key = index << 8 | sub
+    return _KEYS.setdefault(key, key)
+
 
 @final
 class Entry:
@@ -91,7 +99,7 @@ class Entry:
             )
         self.index: Final[int] = index
         self.sub: Final[int] = sub
-        self.key: Final[int] = index << 8 | sub
+        self.key: Final[int] = key_of(index, sub)
         self.name: Final[str] = name
         self.type_code: Final[int] = type_code
         self.bits: Final[int] = BITS.get(type_code, 0)

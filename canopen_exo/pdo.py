@@ -14,6 +14,7 @@ from canopen_exo.bus.node import MS, NEVER
 from canopen_exo.emcy import PDO_TOO_LONG, PDO_TOO_SHORT
 from canopen_exo.errors import CanopenExoError
 from canopen_exo.od import Entry, ObjectDictionary
+from canopen_exo.od import key_of as key_of
 from canopen_exo.signal import Codec, compile_codec
 
 PDO_COUNT: Final = 4
@@ -24,11 +25,6 @@ INVALID: Final = 1 << 31
 
 ABORT_NOT_MAPPABLE: Final = 0x06040041
 ABORT_PDO_LENGTH: Final = 0x06040042
-
-
-def key_of(index: int, sub: int) -> int:
-    """The object dictionary's key of index and sub-index."""
-    return index << 8 | sub
 
 
 _RESTRICTED: Final = ((0x000, 0x07F), (0x101, 0x180), (0x581, 0x5FF), (0x601, 0x67F), (0x6E0, 0x6FF), (0x701, 1 << 30))
@@ -66,7 +62,7 @@ def _mapping(od: ObjectDictionary, map_index: int) -> tuple[list[int], Codec]:
                 f"PDO mapping {map_index:04X}:{sub}: object {word >> 16:04X}:{word >> 8 & 0xFF} is not in the "
                 "object dictionary; map an object of the EDS"
             )
-        keys.append(word >> 8)
+        keys.append(entry.key)
         fields.append((entry.bits, entry.signed))
     return keys, compile_codec(fields)
 
@@ -113,6 +109,9 @@ class TransmitPdo:
 
     def on_sync(self, counter: int) -> bool:
         """Whether this SYNC sends the PDO. counter: the SYNC's counter, 0 when it has none."""
+        if self.countdown > 1:
+            self.countdown -= 1
+            return False
         if self.countdown == 0:  # waiting for the start value; without a counter it is ignored (CiA 301, 18xx:6)
             if counter != self.start and counter != 0:
                 return False
@@ -134,7 +133,8 @@ class TransmitPdo:
 class ReceivePdo:
     """An RPDO. pending: payload waiting for SYNC (synchronous types); last: time of the last reception.
 
-    late, wrong: its silence (8250) or the length of its last payload (8210, 8220) is an error now.
+    late, wrong: its silence (8250) or the length of its last payload (8210, 8220) is an error now. is_steady: it has
+    none, so that the next payload of `size` bytes does no more than move `pending` and `last`.
     deadline: when its silence must be looked at (14xx:5, lazy as in the SYNC consumer), NEVER before the first.
     """
 
@@ -146,7 +146,7 @@ class ReceivePdo:
         keys, codec = _mapping(od, map_index)
         self.keys: Final[list[int]] = keys
         self.codec: Final[Codec] = codec
-        self._size: Final[int] = codec.size
+        self.size: Final[int] = codec.size
         self._unpack: Final[Callable[[bytes], tuple[int, ...]]] = codec.unpack
         self._low: Final[list[int]] = [od.entries[key].low for key in keys]
         self._high: Final[list[int]] = [od.entries[key].high for key in keys]
@@ -159,19 +159,22 @@ class ReceivePdo:
         self.deadline: int = NEVER
         self.late: bool = False
         self.wrong: int = 0
+        self.is_steady: bool = False
 
     def received(self, now: int, data: bytes) -> int:
         """Take a payload; the EMCY code of a wrong length (too long is served, too short is not), else 0."""
         size = len(data)
-        if size < self._size:
+        self.is_steady = False
+        if size < self.size:
             self.wrong = PDO_TOO_SHORT
             return PDO_TOO_SHORT
-        self.wrong = PDO_TOO_LONG if size > self._size else 0
+        self.wrong = PDO_TOO_LONG if size > self.size else 0
         self.late = False
         self.pending = data
         self.last = now
         if self.deadline == NEVER and self.timeout_ns:
             self.deadline = now + self.timeout_ns
+        self.is_steady = self.wrong == 0
         return self.wrong
 
     def apply(self, od: ObjectDictionary) -> bool:
@@ -183,16 +186,20 @@ class ReceivePdo:
         if data is None:
             return False
         self.pending = None
-        raw = self._unpack(data)
         values = od.values
-        limited = self._limited
-        for at, key in enumerate(self.keys):
-            if not limited or self._low[at] <= raw[at] <= self._high[at]:
-                values[key] = raw[at]
+        if self._limited:
+            for key, raw, low, high in zip(self.keys, self._unpack(data), self._low, self._high, strict=True):
+                if low <= raw <= high:
+                    values[key] = raw
+        else:
+            raws = self._unpack(data)
+            for at, key in enumerate(self.keys):
+                values[key] = raws[at]
         return True
 
     def stop(self) -> None:
         """Not operational: nothing pends, nothing is watched."""
+        self.is_steady = False
         self.pending = None
         self.deadline = NEVER
         self.late = False
@@ -207,4 +214,5 @@ class ReceivePdo:
             return False
         self.deadline = NEVER
         self.late = True
+        self.is_steady = False
         return True

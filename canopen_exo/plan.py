@@ -135,9 +135,7 @@ class BusPlan:
         for joint in self.joints:
             if joint.name == name:
                 return joint
-        raise CanopenExoError(
-            f"unknown joint {name!r}; this rig has {', '.join(joint.name for joint in self.joints)}"
-        )
+        raise CanopenExoError(f"unknown joint {name!r}; this rig has {', '.join(joint.name for joint in self.joints)}")
 
     def pdo(self, name: str) -> Pdo:
         """The PDO of that name; raises CanopenExoError naming the ones there are."""

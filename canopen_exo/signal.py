@@ -34,6 +34,9 @@ class Signal:
     index: int
     sub: int
 
+    def __deepcopy__(self, memo: dict[int, object]) -> "Signal":
+        return self  # it never changes: copies share it
+
     @property
     def low(self) -> int:
         """Lowest raw value."""

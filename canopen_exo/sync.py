@@ -44,32 +44,36 @@ class SyncProducer:
 class SyncConsumer:
     """Checks and watches SYNC for one device.
 
-    overflow: 0x1019. timeout_ns: silence after which SYNC counts as lost, 0 = not watched.
+    overflow: 0x1019; size: bytes of a SYNC. timeout_ns: silence after which SYNC counts as lost, 0 = not watched.
+    is_steady: the next SYNC of that size does no more than move `last`.
     Watching starts with the first SYNC and is lazy: `last` moves with every SYNC, `deadline` only when it is reached.
     """
 
     def __init__(self, overflow: int, timeout_ns: int) -> None:
         self.overflow: Final[int] = overflow
         self.timeout_ns: Final[int] = timeout_ns
-        self._size: Final[int] = 1 if overflow else 0
+        self.size: Final[int] = 1 if overflow else 0
         self.last: int = NEVER
         self.deadline: int = NEVER
         self.lost: bool = False
+        self.is_steady: bool = False
 
     def received(self, now: int, data: bytes) -> bool:
         """Take a SYNC; False when its length does not fit 0x1019 (EMCY 8240), and it is not served."""
-        if len(data) != self._size:
+        if len(data) != self.size:
             return False
         self.last = now
         if self.deadline == NEVER and self.timeout_ns:
             self.deadline = now + self.timeout_ns
         self.lost = False
+        self.is_steady = True
         return True
 
     def stop(self) -> None:
         """Watch no more until the next SYNC."""
         self.deadline = NEVER
         self.lost = False
+        self.is_steady = False
 
     def wake(self, now: int) -> bool:
         """True once, when SYNC has been silent for the time-out. Looking early moves the deadline on."""
@@ -80,6 +84,7 @@ class SyncConsumer:
             return False
         self.deadline = NEVER
         self.lost = True
+        self.is_steady = False
         return True
 
 

@@ -24,7 +24,7 @@ from fi_gateway.activation import Activation
 from fi_gateway.control import ARM, DISARM, DISARMED, HELD, NAMED, RESUME, START, STOP, TRIGGER, LiveControl, perform
 from fi_gateway.errors import FaultError
 from fi_gateway.gateway import CONTROLLER_PORT, DRIVE_PORT, CommandPort
-from fi_gateway.injector import Phase
+from fi_gateway.phase import Phase
 
 QUERY: Final = "query"
 WORDS: Final = {1: ARM, 2: DISARM, 3: TRIGGER, 4: START, 5: STOP, 6: RESUME, 7: QUERY}

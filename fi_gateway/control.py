@@ -15,7 +15,8 @@ from canopen_exo.bus.node import NEVER
 from canopen_exo.plan import HLC_STATUS
 from fi_gateway.errors import FaultError
 from fi_gateway.gateway import CONTROLLER_PORT, DRIVE_PORT, Gateway
-from fi_gateway.injector import ACTIVE, ARMED, INERT, SPENT, WAITING, Injector
+from fi_gateway.injector import Injector
+from fi_gateway.phase import ACTIVE, ARMED, INERT, SPENT, WAITING
 
 if TYPE_CHECKING:  # pydantic
     from fi_gateway.addition import Additions

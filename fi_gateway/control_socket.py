@@ -16,7 +16,6 @@ import contextlib
 import ipaddress
 import json
 import socket
-import stat
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -41,9 +40,9 @@ from fi_gateway.control import (
     statistics,
     statistics_text,
 )
+from fi_gateway.control_address import connect, is_path, remove_left, split_address, unix_socket
 from fi_gateway.errors import FaultError
 
-DEFAULT_ADDRESS: Final = "127.0.0.1:29537"
 LIST: Final = "list"
 MAX_LINE: Final = 4096
 """Bytes of a request, its line feed included."""
@@ -125,7 +124,7 @@ class ControlServer:
             if is_path(self._address):
                 self._listen_on_path(Path(self._address))
             else:
-                host, port = _split(self._address)
+                host, port = split_address(self._address)
                 family, kind, proto, _, where = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
                 self._listener = socket.socket(family, kind, proto)
                 self._listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -162,7 +161,7 @@ class ControlServer:
     def _listen_on_path(self, path: Path) -> None:
         """A Unix socket that is ours alone; one that a killed process has left is taken over."""
         remove_left(path)
-        listener = _unix_socket()
+        listener = unix_socket()
         self._listener = listener
         listener.bind(str(path))
         self._path = path
@@ -289,7 +288,7 @@ def ask(address: str, word: str, name: str = "", timeout_s: float = 2.0) -> Answ
 def _ask(address: str, request: Answer, timeout_s: float) -> Answer:
     received = b""
     try:
-        with _connect(address, timeout_s) as link:
+        with connect(address, timeout_s) as link:
             link.sendall(json.dumps(request).encode() + b"\n")
             while not received.endswith(b"\n"):
                 got = link.recv(1 << 16)
@@ -400,57 +399,3 @@ def _shown(given: object) -> str:
 
 def _idle_since(client: _Client) -> int:
     return client.asked_ns
-
-
-def is_path(address: str) -> bool:
-    """Whether an address is that of a Unix socket."""
-    return "/" in address
-
-
-def _split(address: str) -> tuple[str, int]:
-    """`HOST:PORT` or `[IPv6]:PORT`; raises FaultError."""
-    host, _, port = address.rpartition(":")
-    if not (port.isascii() and port.isdigit() and int(port) < 1 << 16):
-        raise FaultError(
-            f"live control: address {address!r} given, allowed HOST:PORT with port 0..65535 (0: a free one), such as "
-            f"{DEFAULT_ADDRESS}, or a path with a / in it"
-        )
-    return host.removeprefix("[").removesuffix("]") or "127.0.0.1", int(port)
-
-
-def _connect(address: str, timeout_s: float) -> socket.socket:
-    """A connection; raises OSError, and FaultError for an address that is none."""
-    if not is_path(address):
-        return socket.create_connection(_split(address), timeout=timeout_s)
-    link = _unix_socket()
-    link.settimeout(timeout_s)
-    try:
-        link.connect(address)
-    except OSError:
-        link.close()
-        raise
-    return link
-
-
-def _unix_socket() -> socket.socket:
-    if not hasattr(socket, "AF_UNIX"):
-        raise FaultError(f"live control: this system has no Unix sockets; use HOST:PORT, such as {DEFAULT_ADDRESS}")
-    return socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-
-
-def remove_left(path: Path) -> None:
-    """Remove a socket that nobody listens at any more, as a killed process leaves it; anything else stays."""
-    with contextlib.suppress(FileNotFoundError):
-        if stat.S_ISSOCK(path.lstat().st_mode) and not _is_alive(path):
-            path.unlink()
-
-
-def _is_alive(path: Path) -> bool:
-    """Whether somebody listens there."""
-    try:
-        _connect(str(path), 1.0).close()
-    except ConnectionRefusedError:
-        return False
-    except OSError:
-        return True
-    return True

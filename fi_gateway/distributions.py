@@ -41,6 +41,9 @@ class Distribution:
         """The next time: ns, 1..NEVER; or, with a period, periods, 0 and more."""
         raise NotImplementedError
 
+    def __deepcopy__(self, memo: dict[int, object]) -> "Distribution":
+        return self  # it never changes: copies share it
+
 
 @final
 class Normal(Distribution):

@@ -28,12 +28,15 @@ from typing import Final, final
 from mypy_extensions import mypyc_attr
 
 from canopen_exo.bus.frame import Frame
+from canopen_exo.bus.medium import Medium
 from canopen_exo.bus.node import MS, NEVER, PASS_ON, TAKE, ErrorState, Out, PortState, Relay
+from canopen_exo.bus.wire import Wire
 from canopen_exo.plan import STATUS_MOTION, STATUS_STOPPED
 from canopen_exo.sync import SyncCadence
 from fi_gateway.activation import Activation
 from fi_gateway.errors import FaultError
 from fi_gateway.injector import Injector
+from fi_gateway.on_wire import OnWire
 from fi_gateway.passage import COMMAND, PLAIN, SYNC_READ, Passage, Route
 from fi_gateway.wire_faults import WireWatch
 
@@ -55,6 +58,7 @@ _STATE: Final = (
     "_away",
     "_probe_at",
     "_is_disturbed",
+    "_media",
 )
 """What `__reduce__` copies besides the constructor arguments; the routes are laid afresh, and what is attached stays
 with the original."""
@@ -125,7 +129,7 @@ class Gateway(Relay):
     those that changed a port's state; malformed: status frames too short to read. time_zero: ns, NEVER until known;
     cadence: of SYNC from the controller.
 
-    Ten public methods: four are a Node's life and its end, five are live control's, one is for wire faults.
+    Eleven public methods: four are a Node's life and its end, five are live control's, two are for wire faults.
     """
 
     def __init__(self, injectors: list[Injector], cycle_ns: int, passage: Passage | None = None) -> None:
@@ -149,12 +153,15 @@ class Gateway(Relay):
         self._passage: Final[Passage] = passage if passage is not None else Passage(self.injectors)
         self._from_controller: Final[list[Route | None]] = self._passage.from_controller
         self._from_drives: Final[list[Route | None]] = self._passage.from_drives
+        self._media: dict[str, Medium] = {}
+        self._on_wire: Final[list[OnWire]] = []
         self._has_wire: bool = False
         for injector in injectors:
             if injector.from_power_up:
                 self._power_up = NEVER
             if injector.wire is not None:
                 injector.wire.listen(_Watch(self, injector))
+                self._on_wire.append(injector.wire)
                 self._has_wire = True
         self._note_passes()
 
@@ -199,6 +206,8 @@ class Gateway(Relay):
         """Open and close the windows that are due, and send what faults have put off until now."""
         passage = self._passage
         passage.advance(now)
+        while self._has_wire and self._turn(now):
+            passage.advance(now)
         self.wake_at = passage.next_ns
         if passage.speaks:
             self._flush(now, out)
@@ -231,6 +240,10 @@ class Gateway(Relay):
                 injector.start(time_zero)
         self._passage.plan()
         self.wake_at = self._passage.next_ns
+
+    def join(self, medium: Medium) -> None:
+        """This is the bus of its name, for wire faults; it has a Wire before a window of theirs opens."""
+        self._media[medium.name] = medium
 
     def attend(self, now: int) -> None:
         """A wire fault has done something: see to it at `now` what comes of that."""
@@ -343,7 +356,23 @@ class Gateway(Relay):
     def _arrange(self, now: int) -> None:
         """Ask to be woken when there is something to do, or at once to say what could not be said without an `out`."""
         passage = self._passage
-        self.wake_at = now if passage.speaks else passage.next_ns
+        self.wake_at = now if passage.speaks or self._has_wire else passage.next_ns
+
+    def _turn(self, now: int) -> bool:
+        """Let the wire faults act whose windows have opened or closed; whether there were any."""
+        turned = False
+        for fault in self._on_wire:
+            if fault.has_turned:
+                fault.has_turned, turned = False, True
+                medium = self._media.get(fault.bus)
+                wire = None if medium is None else medium.wire
+                if not isinstance(wire, Wire):
+                    raise FaultError(
+                        f"gateway: a wire fault on the {fault.bus} bus, which is no emulated bus with errors that it "
+                        "was told of; join it, and install a Wire there"
+                    )
+                fault.turn(now, wire)
+        return turned
 
     def _flush(self, now: int, out: Out) -> None:
         """Send what goes out besides the frame that has arrived, and say what has become active."""

@@ -5,7 +5,6 @@ what its fault asks for.
 """
 
 import zlib
-from enum import Enum
 from typing import Final, final
 
 from numpy.random import PCG64, Generator, SeedSequence
@@ -19,26 +18,10 @@ from fi_gateway.events import Event
 from fi_gateway.faults.base import Fault
 from fi_gateway.on_wire import OnWire
 from fi_gateway.outlet import Line, Tray
+from fi_gateway.phase import ACTIVE, ARMED, INERT, SPENT, WAITING, Phase
 from fi_gateway.repair import Repair
 from fi_gateway.rng_state import state_of
 from fi_gateway.trigger import Report, Trigger
-
-
-class Phase(Enum):
-    """State of an injector; its docstring has the transitions."""
-
-    INERT = "inert"
-    ARMED = "armed"
-    WAITING = "waiting"
-    ACTIVE = "active"
-    SPENT = "spent"
-
-
-INERT: Final = Phase.INERT
-ARMED: Final = Phase.ARMED
-WAITING: Final = Phase.WAITING
-ACTIVE: Final = Phase.ACTIVE
-SPENT: Final = Phase.SPENT
 
 _INJECTOR_STATE: Final = (
     "phase",
@@ -92,17 +75,16 @@ class Target:
         self.name: Final[str] = name
         self.on_bus: Final[bool] = on_bus
 
+    def __deepcopy__(self, memo: dict[int, object]) -> "Target":
+        return self  # it never changes: copies share it
+
     def __reduce__(self) -> tuple[type["Target"], tuple[bool, bool, tuple[int, ...], str, bool]]:
         return Target, (self.to_controller, self.to_drives, self.cob_ids, self.name, self.on_bus)
 
 
 @final
 class Injector:
-    """One injector; the gateway tells it the time and shows it the frames.
-
-    inert --start--> armed --open--> active --close--> armed, or spent (once, infinite)
-    armed --open, no value yet--> waiting --open at the next frame--> active; any --stop--> spent
-    any but spent --disarm--> inert; inert or spent --arm--> armed, or inert while its start has not come
+    """One injector; the gateway tells it the time and shows it the frames. phase: see `phase`.
 
     An event or trigger that comes while waiting or active is ignored. enabled False: never leaves inert until armed.
     from_power_up: its times count from power-up instead of time 0. rng: the stream of this injector alone (`stream`);

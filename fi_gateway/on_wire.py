@@ -1,8 +1,8 @@
 """Wire faults as the faults of injectors: the window is the injector's, what they do happens on a bus.
 
-A fault here is made without a bus; whoever builds the rig attaches it to one (`attach`), and the gateway has itself
-told what it does (`listen`). It acts when its injector is woken, at the instant at which the window opens: a gateway
-that has wire faults asks to be woken then, so that the loop sees what has changed on the bus.
+A fault here knows no bus. When its window has opened or closed, the gateway lets it `turn` on the bus of its name (the
+gateway was told which that is, `Gateway.join`), and it tells the gateway what it does (`listen`). So a gateway that has
+wire faults asks to be woken at that instant.
 Leaves out: buses without a Wire, where these faults are refused before anything runs.
 """
 
@@ -13,24 +13,27 @@ from numpy.random import Generator
 
 from canopen_exo.bus.frame import Frame
 from canopen_exo.bus.loop import Loop
-from canopen_exo.bus.medium import Medium, Port
+from canopen_exo.bus.medium import Medium
 from canopen_exo.bus.node import NEVER
-from canopen_exo.bus.wire import Wire, is_present
-from fi_gateway.errors import FaultError
+from canopen_exo.bus.recovery import is_present
+from canopen_exo.bus.wire import Wire
 from fi_gateway.faults.base import Fault
 from fi_gateway.outlet import Outlet
-from fi_gateway.wire_faults import BabblingIdiot, BusOff, WireFault, WireWatch
+from fi_gateway.wire_faults import BabblingIdiot, WireFault, WireWatch
 
 
 @mypyc_attr(allow_interpreted_subclasses=True)
 class OnWire(Fault):
-    """A fault on a bus. bus: "controller" or "drive"; adds: what it does is frames of its own."""
+    """A fault on a bus. bus: "controller" or "drive"; adds: what it does is frames of its own.
+
+    has_turned: its window has opened or closed, and the bus does not know.
+    """
 
     def __init__(self, bus: str) -> None:
         super().__init__()
         self.bus: str = bus
         self.adds: bool = False
-        self._wire: Wire | None = None
+        self.has_turned: bool = False
 
     @property
     def seen(self) -> int:
@@ -41,32 +44,28 @@ class OnWire(Fault):
         """Have it tell what it does."""
         raise NotImplementedError
 
-    def add_nodes(self, loop: Loop, medium: Medium) -> None:
-        """Connect what it needs there, before the Wire is installed."""
+    def connect(self, loop: Loop, medium: Medium) -> None:
+        """Connect what it needs on its bus, before the Wire is installed."""
 
-    def attach(self, wire: Wire) -> None:
-        """This is its bus."""
-        self._wire = wire
+    def install(self, wire: Wire) -> None:
+        """Give the Wire what it needs to know."""
 
     def begin(self, now: int, held: dict[int, Frame], rng: Generator) -> bool:
-        """Ask for `wake` at once."""
-        if self._wire is None:
-            raise FaultError(f"a wire fault on the {self.bus} bus is not attached to it; only an emulated bus has one")
-        self.wake_at = now
+        """See Fault."""
+        self.has_turned = True
         return super().begin(now, held, rng)
 
     def apply(self, now: int, frame: Frame, outlet: Outlet) -> Frame | None:
         """Nothing happens to frames in the gateway."""
         return frame
 
-    def wake(self, now: int, outlet: Outlet) -> None:
-        """The window has just opened: act."""
-        self.wake_at = NEVER
-        if self._wire is not None:
-            self._act(now, self._wire)
+    def end(self) -> None:
+        """See Fault."""
+        self.has_turned = True
 
-    def _act(self, now: int, wire: Wire) -> None:
-        raise NotImplementedError
+    def turn(self, now: int, wire: Wire) -> None:
+        """Its window has opened or closed: act on the bus."""
+        wire.replan(now)
 
 
 @final
@@ -86,9 +85,8 @@ class Disturbed(OnWire):
         """See OnWire."""
         self.disturbance.watch = watch
 
-    def attach(self, wire: Wire) -> None:
+    def install(self, wire: Wire) -> None:
         """See OnWire."""
-        super().attach(wire)
         wire.disturbances.append(self.disturbance)
 
     def begin(self, now: int, held: dict[int, Frame], rng: Generator) -> bool:
@@ -101,18 +99,16 @@ class Disturbed(OnWire):
         """See Fault."""
         self.disturbance.until = end_ns
 
-    def _act(self, now: int, wire: Wire) -> None:
-        wire.replan(now)
-
-    def __reduce__(self) -> tuple[type["Disturbed"], tuple[str, WireFault]]:
-        return Disturbed, (self.bus, self.disturbance)
+    def __reduce__(self) -> tuple[type["Disturbed"], tuple[str, WireFault], dict[str, object]]:
+        return Disturbed, (self.bus, self.disturbance), {"has_turned": self.has_turned}
 
 
 @final
 class SwitchedOff(OnWire):
-    """A controller that goes bus-off when the window opens, and is asked to restart `restart_ns` after its end.
+    """A controller goes bus-off when the window opens, whatever its counters (TEC = 256), and is asked to restart
+    `restart_ns` after the end of the window. port: its number on that bus. A frame that is on the wire ends first.
 
-    port: its number on that bus.
+    EN 50159: deletion (of everything from and to that node, and of what waits in its queue). FIBlock: none.
     """
 
     def __init__(self, bus: str, port: int, restart_ns: int) -> None:
@@ -120,41 +116,40 @@ class SwitchedOff(OnWire):
         self.port: Final[int] = port
         self.restart_ns: Final[int] = restart_ns
         self._watch: WireWatch = WireWatch()
-        self._end_ns: int = NEVER
-        self._own_restart_ns: int = NEVER
+        self._is_open: bool = False
         self._is_off: bool = False
+        self._own_restart_ns: int = NEVER
 
     def listen(self, watch: WireWatch) -> None:
         """See OnWire."""
         self._watch = watch
 
-    def bound(self, end_ns: int) -> None:
+    def begin(self, now: int, held: dict[int, Frame], rng: Generator) -> bool:
         """See Fault."""
-        self._end_ns = end_ns
-
-    def _act(self, now: int, wire: Wire) -> None:
-        port = self._port(wire)
-        if not is_present(port):
-            return
-        self._is_off = True
-        self._own_restart_ns, port.restart_ns = port.restart_ns, NEVER
-        BusOff(wire, port).begin(now)
-        self._watch.disturbed(now, None)
+        self._is_open = True
+        return super().begin(now, held, rng)
 
     def end(self) -> None:
         """See Fault."""
-        self.wake_at = NEVER
-        if self._wire is not None and self._is_off:
+        self._is_open = False
+        super().end()
+
+    def turn(self, now: int, wire: Wire) -> None:
+        """See OnWire."""
+        port = wire.medium.ports[self.port]
+        if self._is_open and is_present(port):
+            self._is_off = True
+            self._own_restart_ns, port.restart_ns = port.restart_ns, NEVER
+            wire.switch_off(now, port)
+            self._watch.disturbed(now, None)
+        elif self._is_off and not self._is_open:
             self._is_off = False
-            port = self._port(self._wire)
             port.restart_ns = self._own_restart_ns
-            self._wire.restart(self._end_ns, port, self.restart_ns)
+            wire.restart(now, port, self.restart_ns)
 
-    def _port(self, wire: Wire) -> Port:
-        return wire.medium.ports[self.port]
-
-    def __reduce__(self) -> tuple[type["SwitchedOff"], tuple[str, int, int]]:
-        return SwitchedOff, (self.bus, self.port, self.restart_ns)
+    def __reduce__(self) -> tuple[type["SwitchedOff"], tuple[str, int, int], dict[str, object]]:
+        names = ("has_turned", "_is_open", "_is_off", "_own_restart_ns")
+        return SwitchedOff, (self.bus, self.port, self.restart_ns), {name: getattr(self, name) for name in names}
 
 
 @final
@@ -166,25 +161,25 @@ class Babbling(OnWire):
         self.adds = True
         self.frame: Final[Frame] = frame
         self.bit_ns: Final[int] = bit_ns
-        self._idiot: Final[BabblingIdiot] = BabblingIdiot(frame, bit_ns)
-        self._end_ns: int = NEVER
+        self._idiot: BabblingIdiot = BabblingIdiot(frame, bit_ns)
 
     def listen(self, watch: WireWatch) -> None:
         """See OnWire."""
         self._idiot.watch = watch
 
-    def add_nodes(self, loop: Loop, medium: Medium) -> None:
+    def connect(self, loop: Loop, medium: Medium) -> None:
         """See OnWire."""
         loop.connect(self._idiot, [medium])
-        self._idiot.medium_port = medium.ports[-1]
+
+    def begin(self, now: int, held: dict[int, Frame], rng: Generator) -> bool:
+        """See Fault."""
+        self._idiot.begin(now)
+        return super().begin(now, held, rng)
 
     def bound(self, end_ns: int) -> None:
         """See Fault."""
-        self._end_ns = end_ns
         self._idiot.end(end_ns)
 
-    def _act(self, now: int, wire: Wire) -> None:
-        self._idiot.begin(now, self._end_ns)
-
-    def __reduce__(self) -> tuple[type["Babbling"], tuple[str, Frame, int]]:
-        return Babbling, (self.bus, self.frame, self.bit_ns)
+    def __reduce__(self) -> tuple[type["Babbling"], tuple[str, Frame, int], dict[str, object]]:
+        state: dict[str, object] = {"has_turned": self.has_turned, "_idiot": self._idiot}
+        return Babbling, (self.bus, self.frame, self.bit_ns), state

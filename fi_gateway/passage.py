@@ -18,8 +18,9 @@ from canopen_exo.bus.frame import Frame
 from canopen_exo.bus.node import NEVER
 from canopen_exo.plan import HLC_STATUS, SYNC
 from fi_gateway.errors import FaultError
-from fi_gateway.injector import ACTIVE, Injector
+from fi_gateway.injector import Injector
 from fi_gateway.outlet import Later, Line, Tray
+from fi_gateway.phase import ACTIVE
 from fi_gateway.trigger import Report
 from fi_gateway.windows import Windows
 

@@ -93,5 +93,8 @@ class Repair:
             return changed
         return Frame(changed.can_id, data, changed.flags, changed.dlc if changed.flags or changed.dlc > 8 else -1)
 
+    def __deepcopy__(self, memo: dict[int, object]) -> "Repair":
+        return self  # it never changes: copies share it
+
     def __reduce__(self) -> tuple[type["Repair"], tuple[str, int, bytes, int, int]]:
         return Repair, (self._checksum, self._byte, self._prefix, self._counter_start, self._counter_length)

@@ -227,6 +227,8 @@ def injector_warnings(
                 "nothing that triggers it can start" if spec.trigger is not None else "it has no trigger"
             )
             warnings.append(f"injectors.{name}: will stay silent: {reason}")
+        if spec.fault.doubts():
+            warnings.append(f"injectors.{name}.fault: changes nothing: {spec.fault.doubts()}")
         if spec.start == "time_zero":
             for key, text in spec.timing().warnings(place, plan, duration_ns):
                 warnings.append(f"injectors.{name}.{key}: {text}")

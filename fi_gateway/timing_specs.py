@@ -12,8 +12,9 @@ from typing import Final
 from numpy.random import PCG64, Generator
 
 from canopen_exo.plan import HEARTBEAT, HLC_STATUS, STATUS_EVERY, SYNC, BusPlan
-from fi_gateway.effect_specs import EffectChoice, EffectSpec
+from fi_gateway.effect_specs import ConstantTimeSpec, EffectChoice, EffectSpec
 from fi_gateway.event_specs import EventChoice, EventSpec
+from fi_gateway.events import Never
 from fi_gateway.quantity import format_duration
 from fi_gateway.target import Place
 
@@ -110,10 +111,21 @@ class Timing:
             forecast = self.forecast(plan, place.cob_ids, duration_ns)
             if forecast is not None and forecast.share < _RARE:
                 found.append(("event", f"comes in fewer than {100 * _RARE:.0f} % of the runs of {end}"))
-        doubts = self.effect.doubts(plan)
+        doubts = self.effect.doubts(plan) or self._misses(place, plan)
         if doubts:
             found.append(("effect", doubts))
         return found
+
+    def _misses(self, place: Place, plan: BusPlan) -> str:
+        """Why a window that opens at any time may meet no frame; "" when it meets one, or opens with one."""
+        distance_ns = frame_distance(plan, place.cob_ids)
+        if not isinstance(self.effect, ConstantTimeSpec) or self.effect.duration_ns >= distance_ns:
+            return ""
+        event = self.event.build(plan, Generator(PCG64(_SEED)))
+        if event.watches or event.watches_target or isinstance(event, Never):
+            return ""
+        lasts, apart = format_duration(self.effect.duration_ns), format_duration(distance_ns)
+        return f"{lasts} is less than the {apart} between two frames of the target, so that a window may meet none"
 
 
 def frame_distance(plan: BusPlan, cob_ids: tuple[int, ...]) -> int:

@@ -49,6 +49,9 @@ class BusFrame:
         """Whether the frame, whose COB-ID is the right one, has the payload."""
         return len(frame.data) == len(self.data) and int.from_bytes(frame.data, "little") & self._mask == self._value
 
+    def __deepcopy__(self, memo: dict[int, object]) -> "BusFrame":
+        return self  # it never changes: copies share it
+
     def __reduce__(self) -> tuple[type["BusFrame"], tuple[int, bytes, bytes, bool, bool]]:
         return BusFrame, (self.cob_id, self.data, self.mask, self.to_controller, self.to_drives)
 
@@ -97,6 +100,9 @@ class Trigger:
         """The injectors that it listens to."""
         return self.any_of + self.all_of
 
+    def __deepcopy__(self, memo: dict[int, object]) -> "Trigger":
+        return self  # it never changes: copies share it
+
     def __reduce__(
         self,
     ) -> tuple[type["Trigger"], tuple[tuple[str, ...], str, tuple[str, ...], bool, int, float, BusFrame | None]]:
@@ -117,6 +123,9 @@ class Report:
         self.on: Final[str] = on
         self.to_controller: Final[bool] = to_controller
         self.to_drives: Final[bool] = to_drives
+
+    def __deepcopy__(self, memo: dict[int, object]) -> "Report":
+        return self  # it never changes: copies share it
 
     def __reduce__(self) -> tuple[type["Report"], tuple[Frame, str, bool, bool]]:
         return Report, (self.frame, self.on, self.to_controller, self.to_drives)

@@ -11,7 +11,8 @@ from canopen_exo.bus.frame import Frame
 from canopen_exo.bus.node import NEVER
 from fi_gateway.activation import Activation
 from fi_gateway.errors import FaultError
-from fi_gateway.injector import ACTIVE, ARMED, WAITING, Injector
+from fi_gateway.injector import Injector
+from fi_gateway.phase import ACTIVE, ARMED, WAITING
 from fi_gateway.trigger import ACTIVATED, ENDED, MANIFESTED, Report, Trigger
 
 _LINK_STATE: Final = ("_seen", "_said", "_waiting", "_holds")

@@ -4,7 +4,8 @@ A frame that these faults hit is noticed as wrong by its receivers or its sender
 data. The exception is real: of errors that only some receivers see, some double ones leave a valid CRC. (A payload that
 is wrong because a sensor, a memory or a program is, models something upstream of the CAN controller: that is made by
 the faults of a gateway.)
-Every fault acts from `begin` to `end`. Ports are numbers on the medium.
+Every fault acts from `begin` to `end`, on the bits that its window touches. Ports are numbers on the medium. Copies are
+made without who is told (`watch`): whoever has been copied as well listens again.
 Sources: ISO 11898-1 for what the bits are; E. N. Gilbert, "Capacity of a burst-noise channel", Bell System Technical
 Journal 39 (1960), and E. O. Elliott, ibid. 42 (1963), for bursts.
 """
@@ -17,13 +18,12 @@ from mypy_extensions import mypyc_attr
 from canopen_exo.bus.bit_stream import FIELDS, field_positions
 from canopen_exo.bus.disturbance import ALL, DOMINANT, FLIP, NO_ACK, Disruption, Disturbance
 from canopen_exo.bus.frame import Frame
-from canopen_exo.bus.medium import Port
+from canopen_exo.bus.loop import MediumOut
 from canopen_exo.bus.node import NEVER, Node, Out
-from canopen_exo.bus.wire import Wire
 from fi_gateway.errors import FaultError
 
-NEEDS: Final = "medium"
-"""What these faults need; a gateway between two buses cannot make them."""
+_ACK_SLOT_TO_END: Final = 12
+"""ACK slot and delimiter, end of frame and intermission (ISO 11898-1)."""
 
 
 @mypyc_attr(allow_interpreted_subclasses=True)
@@ -45,11 +45,12 @@ class WireFault(Disturbance):
         self.until: int = NEVER
         self.seen: int = 0
         self.watch: WireWatch = WireWatch()
+        self._seen_ns: int = -1
 
     def begin(self, now: int, until: int = NEVER) -> None:
         """Act from `now` on, and no longer from `until` on (NEVER: not known yet)."""
         self.since, self.until = now, until
-        self.seen = 0
+        self.seen, self._seen_ns = 0, -1
 
     def draw_from(self, rng: np.random.Generator) -> None:
         """The stream for what it draws; for those that draw nothing, nothing."""
@@ -62,9 +63,22 @@ class WireFault(Disturbance):
         """Act no longer from `now` on."""
         self.until = min(self.until, now)
 
-    def acts(self, now: int) -> bool:
-        """Whether the window is open."""
-        return self.since <= now < self.until
+    def meets(self, now: int, until: int, frame: Frame | None) -> bool:
+        """Whether an attempt from `now` to `until` and the window touch; the attempt is then counted, once."""
+        if until <= self.since or now >= self.until:
+            return False
+        if frame is not None and now != self._seen_ns:
+            self._seen_ns = now
+            self.seen += 1
+        return True
+
+    def touches(self, start_ns: int, end_ns: int) -> bool:
+        """Whether the window has an instant in common with [start_ns, end_ns)."""
+        return self.since < end_ns and start_ns < self.until
+
+    def state(self) -> dict[str, object]:
+        """What a copy needs besides the arguments."""
+        return {"since": self.since, "until": self.until, "seen": self.seen, "_seen_ns": self._seen_ns}
 
 
 class FrameFault(WireFault):
@@ -75,14 +89,13 @@ class FrameFault(WireFault):
         self.cob_ids: Final[tuple[int, ...]] = cob_ids
         self.senders: Final[int] = senders
 
-    def concerns(self, now: int, frame: Frame | None, sender: int) -> bool:
+    def concerns(self, now: int, until: int, frame: Frame, sender: int) -> bool:
         """Whether it may act on this attempt, which is then counted."""
-        if frame is None or not self.acts(now) or not self.senders >> sender & 1:
+        if not self.senders >> sender & 1:
             return False
         if self.cob_ids and (frame.flags or frame.can_id not in self.cob_ids):
             return False
-        self.seen += 1
-        return True
+        return self.meets(now, until, frame)
 
 
 def mask_of(ports: list[int]) -> int:
@@ -100,41 +113,36 @@ class BitError(FrameFault):
     """One bit of a frame is seen inverted: bit' = 1 - bit.
 
     field: one of `FIELDS`; bit: its index there, from 0, stuff bits not counted; receivers: mask of those who see it
-    (also the sender, if its port is in it); cob_ids, senders: of the frames it hits; attempts: how many attempts it
-    hits, 0 for all (an automatic retransmission is an attempt of its own).
+    (also the sender, if its port is in it); cob_ids, senders: of the frames it hits.
     EN 50159: corruption, detected by the CAN controller, so it appears as a delay, or as a loss. FIBlock: none.
     """
 
     def __init__(
-        self, field: str, bit: int, receivers: int = ALL, cob_ids: tuple[int, ...] = (), attempts: int = 1,
-        senders: int = ALL,
-    ) -> None:  # fmt: skip
+        self, field: str, bit: int, receivers: int = ALL, cob_ids: tuple[int, ...] = (), senders: int = ALL
+    ) -> None:
         super().__init__(cob_ids, senders)
         if field not in FIELDS:
             raise FaultError(f"bit_error: field {field!r} given, allowed {', '.join(FIELDS)}")
-        if bit < 0 or attempts < 0:
-            raise FaultError(f"bit_error: bit {bit} and attempts {attempts} given, allowed 0 and more")
+        if bit < 0:
+            raise FaultError(f"bit_error: bit {bit} given, allowed 0 and more")
         self.field: Final[str] = field
         self.bit: Final[int] = bit
         self.receivers: Final[int] = receivers
-        self.attempts: Final[int] = attempts
-        self.hits: int = 0
-
-    def begin(self, now: int, until: int = NEVER) -> None:
-        """A new window, with all its attempts."""
-        super().begin(now, until)
-        self.hits = 0
 
     def errors(self, now: int, until: int, bit_ns: int, frame: Frame | None, sender: int) -> list[Disruption]:
-        """The bit of this frame, if it is one of those."""
-        if frame is None or not self.concerns(now, frame, sender) or (self.attempts and self.hits >= self.attempts):
+        """The bit of this frame, if it is one of those and the window touches the bit."""
+        if frame is None or not self.concerns(now, until, frame, sender):
             return []
         positions = field_positions(frame, self.field)
         if self.bit >= len(positions):
             return []
-        self.hits += 1
         at = positions[self.bit]
+        if not self.touches(now + at * bit_ns, now + (at + 1) * bit_ns):
+            return []
         return [Disruption(FLIP, at, at + 1, self.receivers)]
+
+    def __reduce__(self) -> tuple[type["BitError"], tuple[str, int, int, tuple[int, ...], int], dict[str, object]]:
+        return BitError, (self.field, self.bit, self.receivers, self.cob_ids, self.senders), self.state()
 
 
 @final
@@ -145,10 +153,9 @@ class StuckDominant(WireFault):
     """
 
     def errors(self, now: int, until: int, bit_ns: int, frame: Frame | None, sender: int) -> list[Disruption]:
-        """All bits within the window."""
-        if until <= self.since or now >= self.until:
+        """All bits that the window touches."""
+        if not self.meets(now, until, frame):
             return []
-        self.seen += 0 if frame is None else 1
         first = max(self.since - now, 0) // bit_ns
         end = (min(self.until, now + (1 << 40)) - now + bit_ns - 1) // bit_ns
         return [Disruption(DOMINANT, first, end)]
@@ -158,6 +165,9 @@ class StuckDominant(WireFault):
         if after >= self.until:
             return NEVER
         return max(after, self.since)
+
+    def __reduce__(self) -> tuple[type["StuckDominant"], tuple[()], dict[str, object]]:
+        return StuckDominant, (), self.state()
 
 
 @final
@@ -172,10 +182,16 @@ class NoAck(FrameFault):
         self.receivers: Final[int] = receivers
 
     def errors(self, now: int, until: int, bit_ns: int, frame: Frame | None, sender: int) -> list[Disruption]:
-        """For every such frame."""
-        if not self.concerns(now, frame, sender):
+        """For every such frame whose ACK slot the window touches."""
+        if frame is None or not self.concerns(now, until, frame, sender):
             return []
-        return [Disruption(NO_ACK, 0, 1, self.receivers)]
+        at = frame.measure() - _ACK_SLOT_TO_END
+        if not self.touches(now + at * bit_ns, now + (at + 1) * bit_ns):
+            return []
+        return [Disruption(NO_ACK, at, at + 1, self.receivers)]
+
+    def __reduce__(self) -> tuple[type["NoAck"], tuple[int, tuple[int, ...], int], dict[str, object]]:
+        return NoAck, (self.receivers, self.cob_ids, self.senders), self.state()
 
 
 class Noise(WireFault):
@@ -205,10 +221,9 @@ class Noise(WireFault):
 
     def errors(self, now: int, until: int, bit_ns: int, frame: Frame | None, sender: int) -> list[Disruption]:
         """The bits that are hit."""
-        if until <= self.since or now >= self.until:
+        if not self.meets(now, until, frame):
             return []
-        self.seen += 0 if frame is None else 1
-        while self._known_ns < until:
+        while self._known_ns < min(until, self.until):  # nothing is drawn for after the window
             self._draw()
         flips = self._flips
         while flips and flips[0] < now:
@@ -225,14 +240,15 @@ class Noise(WireFault):
         """The next bit that is hit."""
         if self.since == NEVER:
             return NEVER
-        flips = self._flips
-        while flips and flips[0] < after:
-            flips.pop(0)
-        while not flips and self._known_ns < self.until:
+        at = 0
+        while True:
+            while at < len(self._flips):
+                if self._flips[at] >= after:
+                    return self._flips[at] if self._flips[at] < self.until else NEVER
+                at += 1
+            if self._known_ns >= self.until:
+                return NEVER
             self._draw()
-            while flips and flips[0] < after:
-                flips.pop(0)
-        return flips[0] if flips and flips[0] < self.until else NEVER
 
     def _draw(self) -> None:
         """Move `_known_ns` on, with the flips up to there."""
@@ -243,6 +259,10 @@ class Noise(WireFault):
         if self._rng is None:
             raise FaultError("noise: it has no random stream; give rng, or call draw_from before begin")
         return int(self._rng.geometric(rate)) * self.bit_ns
+
+    def state(self) -> dict[str, object]:
+        """See WireFault."""
+        return {**super().state(), "_flips": self._flips, "_known_ns": self._known_ns}
 
 
 @final
@@ -262,6 +282,11 @@ class BitErrorRate(Noise):
     def _draw(self) -> None:
         self._known_ns += self._gap(self.rate)
         self._flips.append(self._known_ns)
+
+    def __reduce__(
+        self,
+    ) -> tuple[type["BitErrorRate"], tuple[float, int, np.random.Generator | None, int], dict[str, object]]:
+        return BitErrorRate, (self.rate, self.bit_ns, self._rng, self.receivers), self.state()
 
 
 @final
@@ -307,21 +332,15 @@ class GilbertElliott(Noise):
         self._is_bad = not self._is_bad
         self._change_ns += self._gap(self.leave if self._is_bad else self.enter)
 
-
-@final
-class BusOff:
-    """A controller goes bus-off, whatever its counters: TEC = 256. It restarts as its port is set to.
-
-    EN 50159: loss (of everything from and to that node, and of what waits in its queue). FIBlock: none.
-    """
-
-    def __init__(self, wire: Wire, port: Port) -> None:
-        self.wire: Final[Wire] = wire
-        self.port: Final[Port] = port
-
-    def begin(self, now: int) -> None:
-        """Now; a frame that is on the wire ends first."""
-        self.wire.switch_off(now, self.port)
+    def __reduce__(
+        self,
+    ) -> tuple[
+        type["GilbertElliott"],
+        tuple[float, float, float, float, int, np.random.Generator | None, int],
+        dict[str, object],
+    ]:
+        given = (self.enter, self.leave, self.rate_good, self.rate_bad, self.bit_ns, self._rng, self.receivers)
+        return GilbertElliott, given, {**self.state(), "_is_bad": self._is_bad, "_change_ns": self._change_ns}
 
 
 @final
@@ -329,13 +348,12 @@ class BabblingIdiot(Node):
     """A node that wants to send the same frame all the time: whenever its last one has left the queue, the next.
 
     With id 0 nobody else gets the bus. EN 50159: insertion, delay of everything below it. FIBlock: none.
-    medium_port: its port, known after it was connected; watch: who is told of each frame.
+    watch: who is told of each frame.
     """
 
     def __init__(self, frame: Frame, bit_ns: int) -> None:
         super().__init__()
         self.frame: Final[Frame] = frame
-        self.medium_port: Port | None = None
         self.watch: WireWatch = WireWatch()
         self._bit_ns: Final[int] = bit_ns
         self._until: int = NEVER
@@ -353,13 +371,16 @@ class BabblingIdiot(Node):
         if now >= self._until:
             self.wake_at = NEVER
             return
-        port = self.medium_port
-        if port is None:
-            raise FaultError("babbling_idiot: its port is not known; set medium_port after connecting it to the loop")
-        if port.queued == 0:
+        if not isinstance(out, MediumOut):
+            raise FaultError("babbling_idiot: it has no emulated bus; connect it to a loop in virtual time")
+        if out.ports[0].queued == 0:
             out.send(0, self.frame)
             self.watch.disturbed(now, self.frame)
         self.wake_at = now + _SHORTEST_FRAME * self._bit_ns
+
+    def __reduce__(self) -> tuple[type["BabblingIdiot"], tuple[Frame, int], dict[str, object]]:
+        state: dict[str, object] = {"wake_at": self.wake_at, "_until": self._until}
+        return BabblingIdiot, (self.frame, self._bit_ns), state
 
 
 _SHORTEST_FRAME: Final = 47

@@ -146,16 +146,19 @@ class Controller:
         if cycle >= 0 or self.state.dmp.cycle > 0:
             self._refer(cycle)
         state, params = self.state, self.params
-        q_d, dq_d, ddq_d = state.q_d, state.dq_d, state.ddq_d
         kp, kd = params.kp, params.kd
-        qdd: list[float] = []
-        for j in range(self.n_joints):
-            qdd.append(ddq_d[j] + kd * (dq_d[j] - dq[j]) + kp * (q_d[j] - q[j]))
+        q_d, dq_d = state.q_d, state.dq_d
+        qdd = [0.0] * self.n_joints
+        for j, ahead in enumerate(state.ddq_d):
+            qdd[j] = ahead + kd * (dq_d[j] - dq[j]) + kp * (q_d[j] - q[j])
         command = self.dynamics.inverse(q, dq, qdd)
-        tau: list[float] = []
+        tau = list(command)
         for j, limit in enumerate(params.torque_limit_nm):
             wanted = command[j]
-            tau.append(limit if wanted > limit else -limit if wanted < -limit else wanted)
+            if wanted > limit:
+                tau[j] = limit
+            elif wanted < -limit:
+                tau[j] = -limit
         state.cycle = cycle
         state.tau_command = command
         state.tau = tau
@@ -177,11 +180,7 @@ class Controller:
         while primitive.cycle < cycle:
             dmp.step(primitive)
         q_d = list(primitive.y)
-        per_tau = 1.0 / dmp.tau_s
-        dq_d: list[float] = []
-        for rate in primitive.z:
-            dq_d.append(rate * per_tau)
-        ddq_d = dmp.acceleration_ahead(primitive)
+        dq_d, ddq_d = dmp.reference(primitive)
         if cycle < self.time_zero_cycle:
             self._fade(cycle, q_d, dq_d, ddq_d)
         state.q_d, state.dq_d, state.ddq_d = q_d, dq_d, ddq_d

@@ -84,6 +84,7 @@ class RhythmicDmp:
         self.cycle_ns: Final[int] = cycle_ns
         self.ahead_ns: Final[int] = ahead_ns
         self.tau_s: Final[float] = gait.stride_ns * 1e-9 / (2 * math.pi)
+        self._per_tau: Final[float] = 1.0 / self.tau_s
         self.weights: Final = learn_weights(gait)
         self._start_y: Final[list[float]] = gait.q(np.zeros(1))[0].tolist()
         self._start_z: Final[list[float]] = (self.tau_s * gait.dq(np.zeros(1))[0]).tolist()
@@ -135,11 +136,11 @@ class RhythmicDmp:
         at = state.cycle % self.n_cycles
         forced_y, forced_z = self._step_y[at], self._step_z[at]
         yy, yz, zy, zz = self._yy, self._yz, self._zy, self._zz
-        y, z, goal = state.y, state.z, state.goal
-        for j in range(self.n_joints):
-            gap = y[j] - goal[j]
+        y, z = state.y, state.z
+        for j, goal in enumerate(state.goal):
+            gap = y[j] - goal
             rate = z[j]
-            y[j] = goal[j] + yy * gap + yz * rate + forced_y[j]
+            y[j] = goal + yy * gap + yz * rate + forced_y[j]
             z[j] = zy * gap + zz * rate + forced_z[j]
         state.cycle += 1
 
@@ -149,20 +150,23 @@ class RhythmicDmp:
         forced_y, forced_z = self._ahead_y[at], self._ahead_z[at]
         yy, yz, zy, zz = self._ahead_yy, self._ahead_yz, self._ahead_zy, self._ahead_zz
         y, z, goal = state.y, state.z, state.goal
-        per_tau = 1.0 / self.tau_s
+        per_tau = self._per_tau
         for j in range(self.n_joints):
             gap = y[j] - goal[j]
             q[j] = goal[j] + yy * gap + yz * z[j] + forced_y[j]
             dq[j] = (zy * gap + zz * z[j] + forced_z[j]) * per_tau
 
-    def acceleration_ahead(self, state: RhythmicState) -> list[float]:
-        """The acceleration at `ahead_ns` after the state's cycle: (n_joints,), rad/s^2."""
-        ay, az = self._ahead_ay, self._ahead_az
-        ddq: list[float] = []
-        y, z, goal, force = state.y, state.z, state.goal, self._ahead_f[state.cycle % self.n_cycles]
-        for j in range(self.n_joints):
-            ddq.append(force[j] + ay * (y[j] - goal[j]) + az * z[j])
-        return ddq
+    def reference(self, state: RhythmicState) -> tuple[list[float], list[float]]:
+        """Velocity [rad/s] at the state's cycle, and acceleration [rad/s^2] `ahead_ns` after it: (n_joints,) each."""
+        ay, az, per_tau = self._ahead_ay, self._ahead_az, self._per_tau
+        dq = [0.0] * self.n_joints
+        ddq = [0.0] * self.n_joints
+        y, z, force = state.y, state.z, self._ahead_f[state.cycle % self.n_cycles]
+        for j, goal in enumerate(state.goal):
+            rate = z[j]
+            dq[j] = rate * per_tau
+            ddq[j] = force[j] + ay * (y[j] - goal) + az * rate
+        return dq, ddq
 
 
 def cycles_per_stride(stride_ns: int, cycle_ns: int) -> int:

@@ -67,8 +67,8 @@ class Dynamics:
         mujoco.mj_rne(model, data, 1, self._result)
         tau: list[float] = self._result.tolist()[self._first : self._end]
         armature, damping = self.armature, self.damping
-        for j in range(len(tau)):
-            tau[j] += armature[j] * qdd[j] + damping[j] * dq[j]
+        for j, body in enumerate(tau):
+            tau[j] = body + (armature[j] * qdd[j] + damping[j] * dq[j])
         return tau
 
 

@@ -28,7 +28,7 @@ from canopen_exo.emcy import (
     Emergency,
 )
 from canopen_exo.master import MasterApplication
-from canopen_exo.plan import BusPlan
+from canopen_exo.plan import BusPlan, Pdo
 from canopen_exo.signal import Codec
 from hlc.controller import Controller
 
@@ -41,6 +41,9 @@ DISABLE_TIMEOUT_CYCLES: Final = 25
 
 STOPPING_ERRORS: Final = (HEARTBEAT_LOST, RPDO_TIMEOUT, SYNC_LOST, BUS_OFF_LEFT, ERROR_PASSIVE, OVERRUN)
 """EMCY codes with which a drive drops its torque (its 0x6007 = 2). The statusword says so too, but needs SYNC."""
+
+COMMANDS_KEPT: Final = 4096
+"""Different torque commands of a drive that are remembered as frames."""
 
 DEADLINE_SHARE: Final = 0.6
 """Torques are computed at the latest this share of the cycle after SYNC."""
@@ -100,6 +103,32 @@ class Sample:
 
 
 @final
+class CommandFrames:
+    """The RPDOs of a drive in Operation enabled: as torques recur, so do frames, which are made and measured once."""
+
+    def __init__(self, cob_id: int, pdo: Pdo) -> None:
+        self.cob_id: Final[int] = cob_id
+        self.pdo: Final[Pdo] = pdo
+        self._encode: Final[Callable[..., bytes]] = pdo.codec().encode
+        self._values: Final[list[int]] = [0] * len(pdo.content)
+        self._values[pdo.place("controlword")] = 0x0F
+        self._torque_at: Final[int] = pdo.place("target_torque")
+        self.known: Final[dict[int, Frame]] = {}
+
+    def frame(self, torque: int) -> Frame:
+        """The RPDO that asks for a torque [per mille of rated], not `known` yet."""
+        if len(self.known) >= COMMANDS_KEPT:
+            self.known.clear()
+        self._values[self._torque_at] = torque
+        frame = self.known[torque] = Frame(self.cob_id, self._encode(*self._values))
+        return frame
+
+    def __deepcopy__(self, memo: dict[int, object]) -> "CommandFrames":
+        """Itself: what it remembers does not change what it answers."""
+        return self
+
+
+@final
 class HighLevelController(MasterApplication):
     """Walks for a number of cycles. phase: what it is doing; time_zero: loop time of time 0 [ns], NEVER until known.
 
@@ -138,12 +167,13 @@ class HighLevelController(MasterApplication):
         self._controlword_at: Final[int] = rpdo1.place("controlword")
         self._torque_at: Final[int] = rpdo1.place("target_torque")
         self._command: Final[list[int]] = [0] * len(rpdo1.content)
+        self._commands: Final[list[CommandFrames]] = [CommandFrames(cob_id, rpdo1) for cob_id in self._rpdo]
         self._disable_ns: Final[int] = max(DISABLE_TIMEOUT_NS, DISABLE_TIMEOUT_CYCLES * plan.cycle_ns)
         self._deadline_ns: Final[int] = floor(plan.cycle_ns * DEADLINE_SHARE)
         self._q: list[float] = [0.0] * count
         self._dq: list[float] = [0.0] * count
-        self._heard: list[bool] = [False] * count
-        self._unheard: int = count
+        self._everybody: Final[int] = (1 << count) - 1
+        self._unheard: int = self._everybody
         self._computed: bool = True
         self._words: list[int] = [0] * count
         self._cycle: int = -1
@@ -160,8 +190,7 @@ class HighLevelController(MasterApplication):
     def synchronised(self, now: int, out: Out) -> None:
         """A new cycle begins."""
         self._cycle += 1
-        self._heard = [False] * len(self._q)
-        self._unheard = len(self._q)
+        self._unheard = self._everybody
         self._computed = False
         self.wake_at = now + self._deadline_ns
         if self.phase is _ENABLING:
@@ -189,10 +218,8 @@ class HighLevelController(MasterApplication):
             angle = self._angle[slave]
             self._q[slave] = values[self._position_at] * angle
             self._dq[slave] = values[self._velocity_at] * angle
-            if not self._heard[slave]:
-                self._heard[slave] = True
-                self._unheard -= 1
-            if self._unheard == 0 and not self._computed:
+            self._unheard &= ~(1 << slave)
+            if not self._unheard and not self._computed:
                 self._compute(now, out)
         elif pdo == 2 and len(data) >= self._status_codec.size:
             self._status(now, slave, self._status_codec.unpack(data)[self._statusword_at], out)
@@ -232,7 +259,7 @@ class HighLevelController(MasterApplication):
         if not self._computed:
             if self.phase is _MOTION:
                 for slave in range(len(self.late)):
-                    if not self._heard[slave]:
+                    if self._unheard >> slave & 1:
                         self.late[slave] += 1
             self._compute(now, out)
 
@@ -255,11 +282,10 @@ class HighLevelController(MasterApplication):
                 state = controller.state
                 self.samples.append(Sample(self._motion_cycle, state.q_d, state.dq_d, state.tau_command))
             # torque in per mille of rated, within int16 because the clamp lies far below its range
-            command, torque_at, encode = self._command, self._torque_at, self._encode_command
-            command[self._controlword_at] = 0x0F
-            for slave, cob_id in enumerate(self._rpdo):
-                command[torque_at] = floor(tau[slave] / self._torque[slave] + 0.5)
-                out.send(0, Frame(cob_id, encode(*command)))
+            scale = self._torque
+            for slave, commands in enumerate(self._commands):
+                raw = floor(tau[slave] / scale[slave] + 0.5)
+                out.send(0, commands.known.get(raw) or commands.frame(raw))
         elif phase is _ENABLING or phase is _STOPPING:
             for slave in range(len(self._rpdo)):
                 word = 0x00

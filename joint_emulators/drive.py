@@ -14,10 +14,8 @@ from canopen_exo.od import ABORT_VALUE, ObjectDictionary
 from canopen_exo.pdo import key_of
 from joint_emulators.sensors import (
     EncoderParams,
+    JointSensor,
     VelocityEstimateParams,
-    VelocityEstimateState,
-    encode,
-    estimate_velocity,
     to_int32,
 )
 
@@ -48,28 +46,17 @@ _QUICK_STOP: Final = 3
 class Drive(Application):
     """One joint's drive. torque_nm: joint torque it asks of its motor [N m]; 0 unless Operation enabled in CST.
 
-    `sense` is called after every step of the plant with the truth; everything else comes over the bus.
+    `sensor` samples the truth after every step of the plant; everything else comes over the bus.
     """
 
     def __init__(self, od: ObjectDictionary, encoder: EncoderParams, velocity: VelocityEstimateParams) -> None:
         self.od: Final[ObjectDictionary] = od
-        self.encoder: Final[EncoderParams] = encoder
-        self.velocity: Final[VelocityEstimateParams] = velocity
+        self.sensor: Final[JointSensor] = JointSensor(encoder, velocity)
         self.machine: DriveStateMachine = DriveStateMachine()
-        self.estimate: Final[VelocityEstimateState] = VelocityEstimateState()
         self.torque_nm: float = 0.0
-        self.position_counts: int = 0
-        self.torque_actual_nm: float = 0.0
         self._nm_per_raw: float = od.values[RATED_TORQUE] / 1_000_000
         self._driving: bool = False
         self._limited: bool = False
-
-    def sense(self, q: float, tau: float) -> None:
-        """One sample [1 ms] of the sensors. q: joint angle, rad; tau: joint torque after the gear, N m."""
-        counts = encode(q, self.encoder)
-        estimate_velocity(self.velocity, self.estimate, counts)
-        self.position_counts = counts
-        self.torque_actual_nm = tau
 
     # --- Application ---------------------------------------------------------------------------------------------
 
@@ -83,6 +70,9 @@ class Drive(Application):
         values = self.od.values
         controlword = values[CONTROLWORD]
         machine = self.machine
+        if controlword == machine.last and values[MODE] == values[MODE_DISPLAY]:  # as nearly always
+            self._command_torque()
+            return
         if controlword & FAULT_RESET_BIT and not machine.last & FAULT_RESET_BIT and values[ERROR_REGISTER]:
             controlword &= ~FAULT_RESET_BIT  # no reset while the cause lasts; a bit that is held acts when it is gone
         if controlword != machine.last:
@@ -99,10 +89,10 @@ class Drive(Application):
 
     def latch(self, now: int) -> None:
         """The last finished samples become the actual values."""
-        values = self.od.values
-        values[POSITION] = self.position_counts
-        values[VELOCITY] = to_int32(self.estimate.filtered)
-        raw = floor(self.torque_actual_nm / self._nm_per_raw + 0.5)
+        values, sensor = self.od.values, self.sensor
+        values[POSITION] = sensor.counts
+        values[VELOCITY] = to_int32(sensor.speed)
+        raw = floor(sensor.torque_nm / self._nm_per_raw + 0.5)
         values[TORQUE] = raw if -32768 <= raw <= 32767 else (32767 if raw > 0 else -32768)
 
     def left_operational(self, now: int) -> None:

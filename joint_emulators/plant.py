@@ -55,6 +55,7 @@ class Plant:
         self._gears = layout.gears
         self._model = model
         self._data = data
+        self._command: list[float] = []
         self._ctrl = memoryview(data.ctrl).cast("B")
         self._pack = struct.Struct(f"{n}d").pack_into
         self._qpos = data.qpos[qpos_at : qpos_at + n]
@@ -77,6 +78,7 @@ class Plant:
         if len(q) != len(names):
             raise JointEmulatorError(f"plant: {len(q)} angles given to reset, needed one for each of {names}")
         mujoco.mj_resetData(self._model, self._data)
+        self._command = []
         self._qpos[:] = q
         mujoco.mj_forward(self._model, self._data)
         self._read()
@@ -86,17 +88,23 @@ class Plant:
 
         Raises JointEmulatorError when a command or the state after the step is not finite.
         """
+        if tau_command != self._command:  # the drives change it with SYNC only
+            self._ask(tau_command)
+        mujoco.mj_step(self._model, self._data)
+        self._read()
+
+    def _ask(self, tau_command: list[float]) -> None:
+        """Write the command into the model's inputs, which a step leaves as they are."""
         shafts: list[float] = []
         total = 0.0
-        for at, gear in enumerate(self._gears):
-            shaft = tau_command[at] / gear
+        for tau, gear in zip(tau_command, self._gears, strict=True):
+            shaft = tau / gear
             shafts.append(shaft)
             total += shaft
         self._pack(self._ctrl, 0, *shafts)
         if total - total != 0.0:  # infinite or NaN; MuJoCo would silently command zero to all motors
             raise self._not_finite("torque command", tau_command)
-        mujoco.mj_step(self._model, self._data)
-        self._read()
+        self._command = list(tau_command)
 
     def _read(self) -> None:
         self.q: list[float] = self._qpos.tolist()
@@ -118,6 +126,7 @@ class Plant:
         twin = Plant.__new__(Plant)
         memo[id(self)] = twin
         twin._bind(self._layout, self._model, copy.copy(self._data))
+        twin._command = list(self._command)
         twin.q, twin.dq, twin.tau = self.q, self.dq, self.tau
         return twin
 

@@ -8,11 +8,12 @@ SYNC latches the last finished step.
 from typing import Final, final
 
 from canopen_exo.bus.frame import Frame
-from canopen_exo.bus.node import IGNORE, TAKE, Node, Out, PortState
+from canopen_exo.bus.node import IGNORE, NEVER, TAKE, Node, Out, PortState, open_filter
 from canopen_exo.device import Device
 from canopen_exo.plan import SYNC
 from joint_emulators.drive import Drive
 from joint_emulators.plant import STEP_NS, Plant
+from joint_emulators.sensors import JointSensor, sample
 
 
 @final
@@ -39,13 +40,16 @@ class Rack(Node):
         self.drives: Final[list[Drive]] = drives
         self.truth: list[TruthRow] = []
         self.step_at: int = STEP_NS
+        self._timers_at: int = 0
+        self._torques: Final[list[float]] = [0.0] * len(drives)
+        self._sensors: Final[list[JointSensor]] = [drive.sensor for drive in drives]
         self.wake_at = 0
         self._hearing: list[list[Device]] = []
         self._revision: int = -1
-        self._filter: Final[bytearray] = bytearray(0x800)
+        self._filter: Final[bytearray] = open_filter()
         self.filters = [self._filter] * len(devices)
         self._route()
-        self._sense()
+        sample(self._sensors, plant.q, plant.tau)
 
     def receive(self, now: int, port: int, frame: Frame, out: Out) -> None:
         """A frame on the drive bus: to the devices that listen to its id."""
@@ -53,15 +57,16 @@ class Rack(Node):
             return
         can_id = frame.can_id
         hearing = self._hearing[can_id]
-        if not hearing:
-            return
         if can_id == SYNC:
-            self._synchronise(now, hearing, frame.data, out)
+            for device in hearing:
+                device.synchronise(now, frame.data, out)
+                if device.wake_at < self._timers_at:
+                    self._note(device)
             return
         for device in hearing:
             device.receive(now, 0, frame, out)
-            if device.wake_at < self.wake_at:
-                self.wake_at = device.wake_at
+            if device.wake_at < self._timers_at:
+                self._note(device)
         if can_id == 0 or can_id >= 0x580:  # NMT and SDO may change what the devices listen to
             self._route()
 
@@ -72,8 +77,7 @@ class Rack(Node):
         for device in self._hearing[frame.can_id]:
             if device.port in ports:
                 device.receive(now, 0, frame, out)
-                if device.wake_at < self.wake_at:
-                    self.wake_at = device.wake_at
+                self._note(device)
         self._route()
 
     def port_changed(self, now: int, state: PortState, out: Out) -> None:
@@ -81,43 +85,37 @@ class Rack(Node):
         for device in self.devices:
             if device.port == state.port:
                 device.port_changed(now, state, out)
-                if device.wake_at < self.wake_at:
-                    self.wake_at = device.wake_at
+                self._note(device)
 
-    def _synchronise(self, now: int, hearing: list[Device], data: bytes, out: Out) -> None:
-        wake_at = self.wake_at
-        for device in hearing:
-            device.synchronise(now, data, out)
-            if device.wake_at < wake_at:
-                wake_at = device.wake_at
-        self.wake_at = wake_at
+    def _note(self, device: Device) -> None:
+        """A device may have to be woken earlier than thought; later is seen when that time has come."""
+        if device.wake_at < self._timers_at:
+            self._timers_at = device.wake_at
+            self.wake_at = min(self.step_at, self._timers_at)
 
     def wake(self, now: int, out: Out) -> None:
         """The plant's next step, and the devices' timers."""
         if now >= self.step_at:
             self._step(now)
-        at = self.step_at
-        for device in self.devices:
-            if device.wake_at <= now:
-                device.wake(now, out)
-            if device.wake_at < at:
-                at = device.wake_at
-        self.wake_at = at
+        if now >= self._timers_at:
+            at = NEVER
+            for device in self.devices:
+                if device.wake_at <= now:
+                    device.wake(now, out)
+                if device.wake_at < at:
+                    at = device.wake_at
+            self._timers_at = at
+        self.wake_at = min(self.step_at, self._timers_at)
 
     def _step(self, now: int) -> None:
-        torques: list[float] = []
-        for drive in self.drives:
-            torques.append(drive.torque_nm)
+        torques = self._torques
+        for joint, drive in enumerate(self.drives):
+            torques[joint] = drive.torque_nm
         plant = self.plant
         plant.step(torques)
-        self._sense()
+        sample(self._sensors, plant.q, plant.tau)
         self.truth.append(TruthRow(now, plant.q, plant.dq, plant.tau))
         self.step_at += STEP_NS
-
-    def _sense(self) -> None:
-        q, tau = self.plant.q, self.plant.tau
-        for joint, drive in enumerate(self.drives):
-            drive.sense(q[joint], tau[joint])
 
     def _route(self) -> None:
         """Which devices hear which 11-bit id."""

@@ -110,6 +110,41 @@ def estimate_velocity(params: VelocityEstimateParams, state: VelocityEstimateSta
     return state.filtered
 
 
+@final
+class JointSensor:
+    """What a drive has sampled of its joint, by `sample`.
+
+    counts: of the encoder; speed: counts/s, as estimated; torque_nm: joint torque after the gear [N m].
+    """
+
+    def __init__(self, encoder: EncoderParams, velocity: VelocityEstimateParams) -> None:
+        self.counts: int = 0
+        self.speed: float = 0.0
+        self.torque_nm: float = 0.0
+        self.is_started: bool = False
+        self.factor: Final[float] = encoder.factor
+        self.offset: Final[int] = encoder.offset
+        self.gain: Final[float] = velocity.gain
+        self.rate_hz: Final[float] = velocity.rate_hz
+
+
+def sample(sensors: list[JointSensor], q: list[float], tau: list[float]) -> None:
+    """`encode` and `estimate_velocity` for all joints in one call, after every step.
+
+    q: joint angles [rad, finite]; tau: torques of the motors after the gear [N m].
+    """
+    for joint, sensor in enumerate(sensors):
+        value = q[joint] * sensor.factor / TURN + sensor.offset
+        counts = floor(value + 0.5) if _LOWEST < value < _HIGHEST else to_int32(value)
+        if sensor.is_started:
+            speed = sensor.speed
+            sensor.speed = speed + sensor.gain * ((counts - sensor.counts) * sensor.rate_hz - speed)
+        else:
+            sensor.is_started = True
+        sensor.counts = counts
+        sensor.torque_nm = tau[joint]
+
+
 @dataclass(frozen=True, slots=True)
 class HallParams:
     """pole_pairs: electrical turns per shaft turn; gear_ratio: shaft turns per joint turn.

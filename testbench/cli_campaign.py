@@ -14,10 +14,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from testbench.cli_rig import INVALID, PASS, USAGE, Verbs
+from testbench.cli_rig import HUB_ADDRESS, INVALID, PASS, USAGE, Verbs, add_rig_options, named_buses
 from testbench.errors import BenchError
 
 if TYPE_CHECKING:
+    from testbench.campaign.executor import Executor
+    from testbench.campaign.over_bus import Rigging
     from testbench.campaign.records import RunRow
     from testbench.campaign.runner import Finished
     from testbench.campaign.schema import Campaign
@@ -48,6 +50,9 @@ def add_campaign_verbs(verbs: Verbs, show: Callable[[str], None]) -> None:
     run.add_argument("--no-fork", action="store_true", help="every run from power-up, not from the golden run's middle")
     run.add_argument("--retry", action="store_true", help="make runs that crashed or hung once more")
     run.add_argument("--no-report", action="store_true", help="write no report at the end")
+    run.add_argument("--cluster", metavar="ADDRESS", help="on the workers of dask.distributed, as in tcp://HOST:8786")
+    run.add_argument("--realtime", action="store_true", help="one after another as processes against the clock")
+    add_rig_options(run)
     _add_json(run)
     run.set_defaults(verb=_told(_run, show))
 
@@ -124,12 +129,12 @@ def _told(
 def _run(options: argparse.Namespace, show: Callable[[str], None]) -> int:
     """Make the runs that a campaign wants and its store does not have, in supervised processes.
 
-    Started again, it goes on where it was, whatever ended it. Ctrl-C once: nothing more is begun, runs in flight get a
-    moment; twice: they are dropped.
+    With --cluster on the workers of dask.distributed; with --realtime one after another against the clock, on an own
+    hub or on the buses named, the gateway armed over live control for each run. Started again, it goes on where it was,
+    whatever ended it. Ctrl-C once: nothing more is begun, runs in flight get a moment; twice: they are dropped.
     """
     from testbench.campaign.archive import remember
     from testbench.campaign.identity import code_version
-    from testbench.campaign.pool import Pool
     from testbench.campaign.progress import shown
     from testbench.campaign.records import NO_STATEMENT, Outcome
     from testbench.campaign.runner import Runner, Way
@@ -139,9 +144,12 @@ def _run(options: argparse.Namespace, show: Callable[[str], None]) -> int:
 
     campaign = load_campaign(options.campaign, options.overrides, options.runs)
     path = options.out or _default_store(campaign.name, options.overrides)
-    jobs = options.jobs or _cores()
-    version = code_version()
-    way = Way(version, str(path.with_suffix("")) + "-runs", not options.no_fork, jobs, _command())
+    rigging = _rigging(options)
+    version = code_version() if rigging is None else f"{code_version()} {rigging.words()}"
+    jobs = 1 if rigging is not None else options.jobs or _cores()
+    fork = not options.no_fork and rigging is None
+    way = Way(version, str(path.with_suffix("")) + "-runs", fork, jobs, _command())
+    executor = _executor(options, campaign, rigging, jobs)
     store = open_store(path, write=True)
     try:
         remember(store, campaign)
@@ -150,7 +158,7 @@ def _run(options: argparse.Namespace, show: Callable[[str], None]) -> int:
         runner = Runner(campaign, store, way)
         with Orders().taken() as orders, shown(campaign.name) as watch:
             runner.prepare()
-            finished = runner.run(Pool(jobs), watch, _stopping(orders))
+            finished = runner.run(executor, watch, _stopping(orders))
         rows = store.runs.all(brief=True)
         show(_run_json(campaign, store, rows, finished) if options.json else _run_text(store, rows, finished))
         if finished.interrupted:
@@ -161,6 +169,47 @@ def _run(options: argparse.Namespace, show: Callable[[str], None]) -> int:
     finally:
         store.close()
     return INVALID if any(row.outcome in NO_STATEMENT for row in rows) else PASS
+
+
+def _rigging(options: argparse.Namespace) -> "Rigging | None":
+    """Buses and parts of runs against the clock, None for virtual time; raises BenchError for what does not fit."""
+    of_real_time = ("controller_bus", "drive_bus", "without", "listen", "control", "fifo")
+    given = [f"--{name.replace('_', '-')}" for name in of_real_time if getattr(options, name)]
+    if not options.realtime:
+        if given:
+            raise BenchError(f"{', '.join(given)}: {'is' if len(given) == 1 else 'are'} of real time; add --realtime")
+        return None
+    others = [name for name in ("cluster", "jobs") if getattr(options, name)]
+    if others:
+        raise BenchError(f"--{others[0]}: runs against the clock are made one after another, here; leave it out")
+    from testbench.campaign.over_bus import Rigging
+
+    without = frozenset(options.without)
+    listen = options.listen or (HUB_ADDRESS if without else "127.0.0.1:0")
+    return Rigging(named_buses(options), without, options.fifo, listen, options.control or "")
+
+
+def _executor(
+    options: argparse.Namespace, campaign: "Campaign", rigging: "Rigging | None", jobs: int
+) -> "Executor":
+    """Where the runs are made. Raises BenchError and FaultError for runs that cannot be made there."""
+    if rigging is not None:
+        from testbench.campaign.over_bus import OverBus, check_scenario
+
+        for point in campaign.points:
+            check_scenario(campaign.settings.scenario(point), rigging)
+        return OverBus(rigging)
+    if options.cluster is not None:
+        try:
+            from testbench.campaign.cluster import Cluster
+        except ModuleNotFoundError as error:
+            raise BenchError(
+                f"--cluster: {error.name} is not installed; it comes with the extra: pip install 'exo-hil[cluster]'"
+            ) from error
+        return Cluster(options.cluster)
+    from testbench.campaign.pool import Pool
+
+    return Pool(jobs)
 
 
 def _default_store(name: str, overrides: list[str]) -> Path:
@@ -278,7 +327,7 @@ def _status(options: argparse.Namespace, show: Callable[[str], None]) -> int:
         wanted = int(store.meta("wanted") or len(rows))
         last = made[-1] if made else None
         rate = 60 * last.made / last.wall_s if last is not None and last.wall_s > 0 else 0.0
-        how = "never run" if last is None else last.how if last.how != "running" or store.is_held() else "killed"
+        how = "never run" if last is None else last.how if last.how != "running" or store.is_held() else "broken off"
         document = {"campaign": store.meta("name"), "state": how, **_counts(store, rows)}
         document |= {"wanted": wanted, "runs_per_min": rate, "points": _points(store, rows)}
         if options.json:

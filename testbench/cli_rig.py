@@ -174,6 +174,7 @@ def _add_process(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--epoch", type=int, default=0, metavar="NS", help="CLOCK_MONOTONIC at time 0 of the rig")
     parser.add_argument("--part", type=Path, metavar="FILE", help="leave this process's part of the result there")
     parser.add_argument("--fifo", action="store_true", help="real-time scheduling (SCHED_FIFO), where permitted")
+    parser.add_argument("--busy-poll", action="store_true", help="do not sleep between frames: takes a core of its own")
     _add_supervisor(parser)
 
 
@@ -230,8 +231,8 @@ def _served(serve: Callable[["ProcessOptions"], int], options: argparse.Namespac
     from testbench.process import ProcessOptions
 
     try:
-        how = ProcessOptions(options.epoch, options.part, options.fifo, options.supervisor, options.folder)
-        return serve(how)
+        given = (options.epoch, options.part, options.fifo, options.supervisor, options.folder, options.busy_poll)
+        return serve(ProcessOptions(*given))
     except (BenchError, CanopenExoError, FaultError) as error:
         print(error, file=sys.stderr)
         return USAGE

@@ -183,7 +183,7 @@ def fault_main(word: str, name: str, address: str) -> int:
 def active_faults(address: str) -> list[str]:
     """Names of the injectors that act now; empty when the gateway does not say."""
     from fi_gateway.control_socket import ask_listing
-    from fi_gateway.injector import Phase
+    from fi_gateway.phase import Phase
 
     try:
         listing = ask_listing(address, timeout_s=0.1)
@@ -240,7 +240,7 @@ def _other_rate(control: LiveControl, counts_cycles: bool) -> str:
 
 
 def _leave_part(options: ProcessOptions, process: Session, control: LiveControl) -> None:
-    from testbench.parts import ControlNote, GatewayPart, write_gateway
+    from testbench.parts import ControlNote, GatewayPart, reach_of, write_gateway
 
     assert options.part is not None
     gateway = control.gateway
@@ -251,7 +251,7 @@ def _leave_part(options: ProcessOptions, process: Session, control: LiveControl)
     part = GatewayPart(
         service,
         gateway.time_zero,
-        len(gateway.injectors),
+        {one.name: reach_of(one) for one in gateway.injectors},
         list(gateway.frames),
         list(gateway.lost),
         process.loop.latency,

@@ -24,6 +24,7 @@ from canopen_exo.bus.lateness import Lateness, LatenessDocument
 from canopen_exo.bus.medium import Transmission
 from canopen_exo.errors import CanopenExoError
 from fi_gateway.activation import Activation
+from fi_gateway.injector import Injector
 from testbench.errors import BenchError
 from testbench.record import Array
 
@@ -110,21 +111,40 @@ class ControlNote:
 
 
 @dataclass(frozen=True, slots=True)
+class Reach:
+    """Which frames an injector may have its hands on: those of its COB-IDs, by direction; and those it says itself.
+
+    reports: COB-IDs of the latter.
+    """
+
+    to_controller: bool
+    to_drives: bool
+    cob_ids: tuple[int, ...]
+    reports: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
 class GatewayPart:
-    """The gateway. rows: both buses, in the order of handling; injectors: how many it had.
+    """The gateway. rows: both buses, in the order of handling; injectors: by name.
 
     frames, lost: received, and lost by a fault, by port; latency: receipt to sending, by port sent on.
     """
 
     service: Service
     time_zero: int
-    injectors: int
+    injectors: dict[str, Reach]
     frames: list[int]
     lost: list[int]
     latency: list[Lateness]
     activations: list[Activation]
     controls: list[ControlNote]
     rows: list[Transmission]
+
+
+def reach_of(injector: Injector) -> Reach:
+    """Of one of the gateway's injectors."""
+    target, reports = injector.target, tuple(report.frame.can_id for report in injector.reports)
+    return Reach(target.to_controller, target.to_drives, target.cob_ids, reports)
 
 
 # --- writing ---------------------------------------------------------------------------------------------------------
@@ -192,9 +212,7 @@ def read_hlc(path: Path) -> HlcPart:
     cycles = _column(path, arrays, "cycles")
     q_d, dq_d, tau = (_table(path, arrays, name, cycles.size) for name in ("q_d", "dq_d", "tau_command"))
     service = _service(notes.service)
-    return HlcPart(
-        service, notes.time_zero, notes.completed, notes.held, notes.events, cycles, q_d, dq_d, tau, rows
-    )
+    return HlcPart(service, notes.time_zero, notes.completed, notes.held, notes.events, cycles, q_d, dq_d, tau, rows)
 
 
 def read_gateway(path: Path) -> GatewayPart:
@@ -262,7 +280,7 @@ class _ActivationNote:
 @dataclass(frozen=True, slots=True)
 class _GatewayNotes(_Notes):
     time_zero: int
-    injectors: int
+    injectors: dict[str, Reach]
     frames: list[int]
     lost: list[int]
     latency: list[_LatenessNote]

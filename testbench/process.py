@@ -56,7 +56,7 @@ class ProcessOptions:
     """How a process runs. epoch_ns: time 0 of the rig on CLOCK_MONOTONIC, 0 for now; part: where to leave its part.
 
     fifo: ask for real-time scheduling; supervisor: its process id, 0 for none; folder: of the rig, to be removed when
-    the supervisor is gone.
+    the supervisor is gone; busy_poll: as `RealTimeLoop`.
     """
 
     epoch_ns: int = 0
@@ -64,6 +64,7 @@ class ProcessOptions:
     fifo: bool = False
     supervisor: int = 0
     folder: Path | None = None
+    busy_poll: bool = False
 
 
 @final
@@ -116,6 +117,7 @@ class Session:
             options.epoch_ns or time.monotonic_ns(),
             record=options.part is not None,
             measure_latency=name == "gateway",
+            busy_poll=options.busy_poll,
         )
         self.start_ns: Final[int] = (self.loop.now() // MS + 1) * MS
         self._channels: Final[list[Channel]] = channels

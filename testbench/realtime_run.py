@@ -21,9 +21,8 @@ from testbench.errors import BenchError
 from testbench.merge import IncompleteError, add_reasons, merge, time_zero_of
 from testbench.parts import PartError, read_gateway, read_hlc, read_joints
 from testbench.record import RunRecord
-from testbench.run import CHUNK_NS, LEAVE_NS, START_NS, Progress, Result, judge_pair
+from testbench.run import CHUNK_NS, LEAVE_NS, START_NS, Progress, Result, result_of
 from testbench.scenario import Scenario
-from testbench.summary import summary_document
 from testbench.supervisor import Setup, Supervisor, check_status_readers
 from testbench.timing import Timing, TimingLimits, judge_timing
 
@@ -72,18 +71,15 @@ def run_realtime(
             golden, faulted = _run_pair(setup, progress, announce, host.processes["hub"])
     else:
         golden, faulted = _run_pair(setup, progress, announce, None)
-    judgement = judge_pair(scenario, golden.record, faulted.record)
-    document = summary_document(
-        scenario.name,
-        scenario.seed,
-        golden.record,
-        faulted.record,
-        judgement,
-        sim_time_s=sum(run.record.duration_s + scenario.motion.stride_ns / 1e9 for run in (golden, faulted)),
-        wall_time_s=time.perf_counter() - started,
-    )
-    document["realtime"] = _timing_entry(limits_in(scenario), golden.timing, faulted.timing)
-    return Result(scenario, golden.record, faulted.record, judgement, document)
+    return pair_result(scenario, golden, faulted, time.perf_counter() - started)
+
+
+def pair_result(scenario: Scenario, golden: RealTimeRun, faulted: RealTimeRun, wall_time_s: float) -> Result:
+    """The pair judged, and what is said about it."""
+    sim_time_s = sum(run.record.duration_s + scenario.motion.stride_ns / 1e9 for run in (golden, faulted))
+    result = result_of(scenario, golden.record, faulted.record, sim_time_s=sim_time_s, wall_time_s=wall_time_s)
+    result.document["realtime"] = _timing_entry(limits_in(scenario), golden.timing, faulted.timing)
+    return result
 
 
 def _run_pair(
@@ -105,15 +101,18 @@ def run_once(
     *,
     announce: Callable[[str], None] = lambda text: None,
     hub: Process | None = None,
+    when_ready: Callable[[Supervisor], None] = lambda rig: None,
 ) -> RealTimeRun:
     """One run from power-up to disabled drives, its parts merged and its timing judged. Raises BenchError.
 
-    announce: told what foreign software is waited for; hub: that the buses are on, where it serves more than this run.
+    announce: told what foreign software is waited for; hub: that the buses are on, where it serves more than this run;
+    when_ready: called when all processes are heard, before time 0.
     """
     which = "faulted run" if setup.faults else "golden run"
     try:
         with Supervisor(setup, announce=lambda text: announce(f"{which}: {text}"), hub=hub) as rig:
             rig.start()
+            when_ready(rig)
             _drive_through(rig, setup, progress)
             rig.stop()
             return _gather(rig, setup)

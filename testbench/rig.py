@@ -77,6 +77,7 @@ def build_rig(params: RigParams, injectors: list[Injector]) -> Rig:
     loop.connect(gateway, [controller_bus, drive_bus])
     loop.connect(rack, [drive_bus] * len(plan.joints))
     for medium in (controller_bus, drive_bus):
+        gateway.join(medium)
         _install_wire(loop, medium, injectors)
     return Rig(params, loop, controller_bus, drive_bus, master, controller, gateway, rack)
 
@@ -87,11 +88,11 @@ def _install_wire(loop: Loop, medium: Medium, injectors: list[Injector]) -> None
     if not faults:
         return
     for fault in faults:
-        fault.add_nodes(loop, medium)
+        fault.connect(loop, medium)
     wire = Wire(medium, [])
     loop.install(wire, medium)
     for fault in faults:
-        fault.attach(wire)
+        fault.install(wire)
 
 
 def build_mechanics(params: RigParams) -> str:
@@ -103,9 +104,7 @@ def build_master(params: RigParams, mjcf: str, cycles: int = -1) -> tuple[Master
     """The high-level controller on the bus. cycles: of the motion; -1 for the duration in `params`."""
     plan = params.plan
     names = tuple(joint.name for joint in plan.joints)
-    law = build_controller(
-        paper_params(names, plan.cycle_ns, params.stride_ns), names, packaged_recording(), mjcf
-    )
+    law = build_controller(paper_params(names, plan.cycle_ns, params.stride_ns), names, packaged_recording(), mjcf)
     controller = HighLevelController(plan, law, params.duration_ns // plan.cycle_ns if cycles < 0 else cycles)
     return Master(plan, tuple(_slave(plan, joint) for joint in plan.joints), controller), controller
 

@@ -7,7 +7,7 @@ them comes from the faults.
 import gc
 import time
 from bisect import bisect_right
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Final
@@ -15,8 +15,9 @@ from typing import Final
 import numpy as np
 
 from canopen_exo.bus.frame import FLAG_ERROR
-from canopen_exo.bus.medium import Transmission
+from canopen_exo.bus.medium import Medium, Transmission
 from canopen_exo.bus.node import MS, NEVER, SECOND
+from canopen_exo.bus.wire import Wire
 from fi_gateway.injector import Injector
 from fi_gateway.replay import Window
 from fi_gateway.schema import build_injectors
@@ -209,26 +210,37 @@ def record_of(rig: Rig) -> RunRecord:
 
 
 def _stats(rig: Rig, rows: list[Transmission]) -> tuple[BusStats, ...]:
-    """Of each bus, frames that ended within the motion, and the share of it that they lasted (no error frames)."""
+    """Of each bus, what passed within the motion, and the share of it in which the bus was busy."""
     media = (rig.controller_bus, rig.drive_bus)
     start = rig.controller.time_zero
     end = start + rig.params.duration_ns
-    frames, bits = [0] * len(media), [0] * len(media)
-    first = bisect_right(rows, start, key=lambda row: row.end_ns)
-    for at in range(first, bisect_right(rows, end, key=lambda row: row.end_ns)):
-        row = rows[at]
-        if not row.frame.flags & FLAG_ERROR:
-            frames[row.bus] += 1
-            bits[row.bus] += row.frame.bits
     return tuple(
-        BusStats(
-            medium.name,
-            frames[medium.index],
-            bits[medium.index] * medium.bit_ns / (end - start),
-            sum(port.dropped for port in medium.ports),
-        )
-        for medium in media
+        BusStats(medium.name, frames, busy_ns / (end - start), sum(port.dropped for port in medium.ports))
+        for medium, (frames, busy_ns) in zip(media, traffic(rows, media, start, end), strict=True)
     )
+
+
+def traffic(rows: list[Transmission], media: Sequence[Medium], start: int, end: int) -> list[tuple[int, int]]:
+    """Of each bus, frames that ended within (start, end], and the time for which it was busy with them or with errors.
+
+    [ns]. Of a disturbed attempt to send it is the whole span that counts, with error frames and what they broke off.
+    media: by their index.
+    """
+    spans = [medium.wire.spans if isinstance(medium.wire, Wire) else [] for medium in media]
+    busy_ns = [sum(last - first for first, last in each if start < last <= end) for each in spans]
+    frames, at = [0] * len(media), [0] * len(media)
+    begin = bisect_right(rows, start, key=lambda row: row.end_ns)
+    for place in range(begin, bisect_right(rows, end, key=lambda row: row.end_ns)):
+        row = rows[place]
+        bus, each = row.bus, spans[row.bus]
+        if row.frame.flags & FLAG_ERROR:
+            continue
+        frames[bus] += 1
+        while at[bus] < len(each) and each[at[bus]][1] < row.end_ns:
+            at[bus] += 1
+        if at[bus] == len(each) or row.end_ns <= each[at[bus]][0]:
+            busy_ns[bus] += row.frame.bits * media[bus].bit_ns
+    return list(zip(frames, busy_ns, strict=True))
 
 
 def _invalid_reasons(rig: Rig) -> list[str]:

@@ -1,5 +1,9 @@
-"""The live status line of a running rig: one line, rewritten in place, on a terminal only."""
+"""The live status line of a running rig: one line, rewritten in place, on a terminal only.
 
+What the terminal is too narrow for is cut off, lateness first: a line that wraps could not be rewritten.
+"""
+
+import os
 from collections.abc import Callable
 from typing import Final, TextIO, final
 
@@ -29,9 +33,16 @@ class StatusLine:
         """Rewrite the line when it is time."""
         if not self._is_on or now < self._next_ns:
             return
-        self._stream.write(f"\r\x1b[K{self.text(now)}")
+        self._stream.write(f"\r\x1b[K{_cut(self.text(now), self._width())}")
         self._stream.flush()
         self._next_ns = now + EVERY_NS
+
+    def _width(self) -> int:
+        """Columns of the terminal; 0 where it does not tell."""
+        try:
+            return os.get_terminal_size(self._stream.fileno()).columns
+        except (OSError, ValueError):
+            return 0
 
     def clear(self) -> None:
         """Make room for another line."""
@@ -49,20 +60,25 @@ class StatusLine:
             for bits, before in zip(watch.bits, self._bits, strict=True)
         ]
         self._bits, self._shown_ns = list(watch.bits), now
-        parts = [
-            f"{_MOTION.get(watch.motion, 'unknown')} {_since(watch, now)}",
-            f"load {loads[0]:.0f} %, {loads[1]:.0f} %",
-            f"late {watch.late} of {watch.cycles} cycles, SYNC off by at most {watch.worst_ns / 1e6:.1f} ms",
-            f"drives: {states_text(watch.states.values())}",
-        ]
-        for name, state in zip(("controller bus", "drive bus"), watch.ports, strict=True):
-            if state is not ErrorState.ERROR_ACTIVE:
-                parts.append(f"{name} {state.value.replace('_', ' ')}")
+        parts = [f"{_MOTION.get(watch.motion, 'unknown')} {_since(watch, now)}".rstrip()]
         faults = self._faults()
         if faults:
             parts.append(f"faults: {', '.join(faults)}")
+        for name, state in zip(("controller bus", "drive bus"), watch.ports, strict=True):
+            if state is not ErrorState.ERROR_ACTIVE:
+                parts.append(f"{name} {state.value.replace('_', ' ')}")
+        parts += [
+            f"drives: {states_text(watch.states.values())}",
+            f"load {loads[0]:.0f} %, {loads[1]:.0f} %",
+            f"late {watch.late} of {watch.cycles} cycles, SYNC off by at most {watch.worst_ns / 1e6:.1f} ms",
+        ]
         return " | ".join(parts)
 
 
 def _since(watch: Watch, now: int) -> str:
     return f"{(now - watch.time_zero) / 1e9:.1f} s" if watch.time_zero != NEVER else ""
+
+
+def _cut(text: str, width: int) -> str:
+    """The text in less than `width` columns, so that the cursor stays in its line."""
+    return text[: width - 1] if width else text

@@ -24,7 +24,7 @@ from canopen_exo.bus.medium import Transmission
 from canopen_exo.bus.node import MS, NEVER, SECOND
 from canopen_exo.bus.realtime import RealTimeLoop
 from canopen_exo.emcy import error_words
-from fi_gateway.control_socket import is_path, remove_left
+from fi_gateway.control_address import is_path, remove_left
 from fi_gateway.schema import status_watchers
 from testbench.child import Process, ProcessError
 from testbench.errors import BenchError

@@ -139,9 +139,7 @@ def judge(
     )
 
 
-def _outcome(
-    valid: bool, errors: tuple[Violation, ...], failures: tuple[Violation, ...], faulted: RunRecord
-) -> str:
+def _outcome(valid: bool, errors: tuple[Violation, ...], failures: tuple[Violation, ...], faulted: RunRecord) -> str:
     """The worst that can be said, worst first."""
     if not valid:
         return "invalid"

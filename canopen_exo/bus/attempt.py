@@ -1,4 +1,4 @@
-"""What came of an attempt that the bit engine worked out, as steps in the order in which they happen.
+"""An attempt that the bit engine works out: who takes part, and what came of it, as steps in their order.
 
 Source: see `controller`. A frame counts as received at the end of its intermission, as on an undisturbed bus, although
 a receiver accepts it with the last but one bit of EOF, four bits before.
@@ -9,6 +9,7 @@ from typing import Final, final
 from canopen_exo.bus.controller import ACCEPT_TO_END, Controller, Detected
 from canopen_exo.bus.frame import Frame
 from canopen_exo.bus.medium import Port
+from canopen_exo.bus.recovery import is_present
 
 COUNT: Final = 0
 ERROR: Final = 1
@@ -38,6 +39,54 @@ class Step:
         self.frame: Final[Frame | None] = frame
         self.ports: Final[list[Port]] = [] if ports is None else ports
         self.error: Final[Detected | None] = error
+
+    def __reduce__(
+        self,
+    ) -> tuple[type["Step"], tuple[int, int, Port, int, int, Frame | None, list[Port], Detected | None]]:
+        return Step, (self.at, self.kind, self.port, self.tec, self.rec, self.frame, self.ports, self.error)
+
+
+def put_back(waiting: list[tuple[Frame, Port]], frame: Frame, port: Port) -> None:
+    """A frame under way that was taken for undisturbed, back among those that wait: before those of its id."""
+    at = 0
+    while at < len(waiting) and waiting[at][0].arbitration < frame.arbitration:
+        at += 1
+    waiting.insert(at, (frame, port))
+
+
+def controllers_of(
+    offers: list[tuple[Frame, Port]], unsettled: list[Controller], ports: list[Port]
+) -> list[Controller]:
+    """Who takes part: senders of the offers, last one first, then receivers; ports: of the medium, by number.
+
+    unsettled: those that have not come to rest after an earlier error; they go on from where they were.
+    """
+    controllers: list[Controller] = []
+    known = 0
+    sending = 0
+    for _, port in offers:
+        sending |= 1 << port.number
+    for controller in unsettled:
+        others = [number for number in controller.ports if not sending >> number & 1]
+        if others:
+            controllers.append(controller.part(others))
+        for number in controller.ports:
+            known |= 1 << number
+    for frame, port in offers:
+        sender = Controller([port.number], port.tec, port.rec)
+        for controller in unsettled:
+            if port.number in controller.ports:
+                sender = controller.part([port.number])
+        sender.send(frame)
+        controllers.insert(0, sender)
+        known |= 1 << port.number
+    alike: dict[tuple[int, int], list[int]] = {}
+    for port in ports:
+        if not known >> port.number & 1 and is_present(port):
+            alike.setdefault((port.tec, port.rec), []).append(port.number)
+    for counters, numbers in alike.items():
+        controllers.append(Controller(numbers, counters[0], counters[1]))
+    return controllers
 
 
 def steps_of(controllers: list[Controller], bits: int, ports: list[Port]) -> list[Step]:

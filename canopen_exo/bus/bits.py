@@ -14,6 +14,7 @@ CRC_POLYNOMIAL: Final = 0x4599
 UNSTUFFED_TAIL: Final = 13
 """CRC delimiter 1, ACK slot 1, ACK delimiter 1, end of frame 7, intermission 3; never stuffed."""
 
+
 def _crc_of_bytes() -> list[int]:
     table = []
     for byte in range(256):

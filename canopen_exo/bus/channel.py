@@ -13,7 +13,7 @@ from typing import Final, final
 from mypy_extensions import mypyc_attr
 
 from canopen_exo.bus.frame import Frame
-from canopen_exo.bus.node import MS, NEVER, PortState
+from canopen_exo.bus.node import MS, NEVER, SECOND, PortState
 
 _COMPARISONS: Final = 5
 _COMPARED_WITHIN_NS: Final = 5_000
@@ -78,25 +78,33 @@ class Channel:
         """Bring `overruns` up to date, where it is told with the next frame only; for statistics, not per frame."""
 
 
-RecordArrival = tuple[int, int, int, bytes, Arrival | None]
-"""What came, undecoded: stamp [ns], the `place` given, CAN id and record of a base data frame (11-bit id, 0..8 bytes),
-None; for all else id -1, no record, and the Arrival. A plain tuple: one is made for every frame of a full gateway."""
-
-
 @mypyc_attr(allow_interpreted_subclasses=True)
 class RecordChannel(Channel):
-    """A channel whose frames can go, as the bytes that came, to another channel of the same class."""
+    """A channel whose base data frames (11-bit id, 0..8 bytes) can go, as the bytes that came, to another one.
 
-    def receive_records(self, place: int) -> list[RecordArrival]:
-        """As `receive`, undecoded. place: put into every tuple."""
+    Of the last `read` - count: what it found; ids, stamps: of each, when it found nothing but base data frames. The
+    stamps never go back.
+    """
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name)
+        self.count: int = 0
+        self.ids: list[int] = []
+        self.stamps: list[int] = []
+
+    def read(self) -> bool:
+        """As `receive`, but keep what came until the next call; False when it is not base data frames alone."""
         raise NotImplementedError
 
-    def send_record(self, record: bytes) -> bool:
-        """As `send`, with a record that such a channel received."""
+    def arrival(self, number: int) -> Arrival:
+        """One of those that the last `read` found."""
         raise NotImplementedError
 
-    def frame_in(self, record: bytes) -> Frame:
-        """The frame in the record of a RecordArrival."""
+    def send_run(self, source: "RecordChannel", start: int, end: int) -> int:
+        """Hand over base data frames that the last `read` of `source`, of the same class, found, from start up to end.
+
+        How many were taken; the next one is to be given to `send`, which sees to what is in its way.
+        """
         raise NotImplementedError
 
 
@@ -107,8 +115,7 @@ class StampClock:
     Both clocks are compared anew for every batch, at most once a millisecond, so a corrected wall clock does no harm: a
     stamp lies between the one before it and now, whatever the wall clock did meanwhile. `begin` comes after the
     reading: what arrives between the two, while the process is held up, would count as earlier than it was sent.
-    now: of the last `begin`; offset: what to take from a stamp, ns; last: the stamp given last. A channel that reads
-    many stamps at once does what `at` does by itself.
+    now: of the last `begin`; offset: what to take from a stamp, ns; last: the stamp given last.
     """
 
     def __init__(self) -> None:
@@ -154,3 +161,15 @@ class StampClock:
             stamp = self.last
         self.last = stamp
         return stamp
+
+    def many(self, seconds: list[int], nanos: list[int]) -> list[int]:
+        """As `at` for at least one stamp of CLOCK_REALTIME, in two parts."""
+        if seconds.count(seconds[0]) == len(seconds):
+            start = seconds[0] * SECOND - self.offset
+            stamps = [start + nano for nano in nanos]
+        else:
+            stamps = [second * SECOND + nano - self.offset for second, nano in zip(seconds, nanos, strict=True)]
+        if stamps[0] < self.last or stamps[-1] > self.now or stamps != sorted(stamps):
+            return [self.at(stamp + self.offset) for stamp in stamps]
+        self.last = stamps[-1]
+        return stamps

@@ -127,9 +127,7 @@ def open_channel(bus: BusName) -> Channel:
         return _open_hub(bus)
     from canopen_exo.bus.adapter import PythonCanChannel, open_python_can
 
-    return PythonCanChannel(
-        str(bus), lambda: open_python_can(bus.interface, bus.channel, bus.bitrate, bus.context)
-    )
+    return PythonCanChannel(str(bus), lambda: open_python_can(bus.interface, bus.channel, bus.bitrate, bus.context))
 
 
 def _open_socketcan(bus: BusName) -> Channel:

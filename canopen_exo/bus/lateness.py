@@ -3,6 +3,7 @@
 Eight bins to the octave, in whole nanoseconds: a percentile is exact to 12.5 %, counts and the worst value are exact.
 """
 
+from bisect import bisect_right
 from typing import Final, TypedDict, final
 
 from canopen_exo.errors import CanopenExoError
@@ -11,6 +12,9 @@ _BINS: Final = 8 * 58 + 16
 """Bins for all values below 2**62 ns."""
 
 _TOP_NS: Final = (1 << 62) - 1
+
+_FEW: Final = 12
+"""Fewer delays than these are counted one by one."""
 
 
 class LatenessDocument(TypedDict):
@@ -44,6 +48,22 @@ class Lateness:
             self._bins[(octave << 3) + (delay_ns >> octave)] += 1
         else:
             self._bins[_bin(delay_ns if delay_ns > 0 else 0)] += 1
+
+    def add_since(self, times: list[int], now: int) -> None:
+        """Count the delays of these times, in ascending order, until `now`."""
+        left = len(times)
+        if left < _FEW:
+            for time_ns in times:
+                self.add(now - time_ns)
+            return
+        self.count += left
+        if now - times[0] > self.worst_ns:
+            self.worst_ns = now - times[0]
+        while left:  # bin by bin, from the shortest
+            index = _bin(max(now - times[left - 1], 0))
+            first = bisect_right(times, now - _lower(index + 1), 0, left)
+            self._bins[index] += left - first
+            left = first
 
     def percentile(self, share: float) -> int:
         """The delay [ns] that at least `share` (0..1) of the values do not exceed: its bin's upper edge."""

@@ -2,6 +2,9 @@
 
 At each instant: frames that end (by bus; each bus ends at most one), then nodes that are due (by index), then idle
 buses arbitrate. No clock is read: the same nodes give the same trace on every machine.
+
+A frame goes to the nodes whose acceptance filter takes it (`Node.filters`). What a Relay only passes on is put into the
+queue of its other port here, which is what its `receive` would do.
 """
 
 import copy
@@ -9,7 +12,7 @@ from typing import Final, final
 
 from canopen_exo.bus.frame import Frame
 from canopen_exo.bus.medium import QUEUE_LENGTH, Listener, Medium, Port, Transmission, WireEvent, WireSink, Wiring
-from canopen_exo.bus.node import NEVER, PASS_ON, SECOND, ErrorState, Node, Out, PortState, Relay
+from canopen_exo.bus.node import NEVER, NO_FILTER, PASS_ON, SECOND, ErrorState, Node, Out, PortState, Relay
 from canopen_exo.errors import CanopenExoError
 
 
@@ -42,7 +45,8 @@ class Loop:
         self.outs: list[MediumOut] = []
         self.now: int = 0
         self._ends: Final[list[int]] = []
-        self._passed: Final[list[tuple[Frame, Port]]] = []
+        self._frames: Final[list[Frame]] = []
+        self._senders: Final[list[Port]] = []
         self._rows: Final[list[Transmission]] = []
         self._recalled: int = 0
         self._nowhere: Final[Medium] = Medium("none", -1, SECOND)
@@ -52,15 +56,16 @@ class Loop:
         """Every frame that passed a bus so far, in loop order."""
         rows = self._rows
         for at in range(len(rows) - self._recalled, len(self._ends)):
-            frame, sender = self._passed[at]
-            rows.append(Transmission(self._ends[at], sender.medium.index, frame, sender.number))
+            sender = self._senders[at]
+            rows.append(Transmission(self._ends[at], sender.medium.index, self._frames[at], sender.number))
         return rows
 
     def forget(self) -> None:
         """Leave the trace so far to somebody else who has it, and may give it back (`resume`)."""
         self._rows.clear()
         self._ends.clear()
-        self._passed.clear()
+        self._frames.clear()
+        self._senders.clear()
         self._recalled = 0
 
     def resume(self, rows: list[Transmission]) -> None:
@@ -72,8 +77,9 @@ class Loop:
 
     def __deepcopy__(self, memo: dict[int, object]) -> "Loop":
         """The same state between two instants; the rows of the trace are shared."""
-        twin = Loop(copy.deepcopy(self.media, memo))
-        memo[id(self)] = twin
+        twin = Loop([])
+        memo[id(self)] = twin  # first: a Wire on a medium leads back here
+        twin.media.extend(copy.deepcopy(self.media, memo))
         twin.nodes = copy.deepcopy(self.nodes, memo)
         twin.outs = copy.deepcopy(self.outs, memo)
         twin.now = self.now
@@ -119,19 +125,24 @@ class Loop:
         self.outs.append(MediumOut())
 
     def run_until(self, until: int) -> None:
-        """Serve every instant up to and including `until` [ns]."""
+        """Serve every instant up to and including `until` [ns].
+
+        Longer than a function should be: nearly all instants are the end of one frame, and each call for one counts.
+        """
         if until < self.now:
             raise CanopenExoError(f"loop: run until {until} ns given, it is {self.now} ns; time does not go back")
         now = self.now
         wake = self._first_wake()
         if wake < now:
             raise CanopenExoError(f"loop: a node asks to be woken at {wake} ns, it is {now} ns; wake_at must move on")
-        media, ends, passed = self.media, self._ends, self._passed
+        media = self.media
+        ends, frames, senders = self._ends, self._frames, self._senders
         first = self._nowhere
+        is_shared = is_due = False
+        bound = wake if wake <= until else until + 1  # frames that end before it come next
         while True:
             # idle buses arbitrate (at first: what was queued between two calls); then it shows which frame ends first
             end = NEVER
-            is_alone = True
             for medium in media:
                 at = medium.end
                 if at == NEVER:
@@ -140,6 +151,7 @@ class Loop:
                         if waiting or medium.is_restless:
                             medium.arbitrate(now)
                             wake = self._first_wake()
+                            bound = wake if wake <= until else until + 1
                         at = medium.end
                         if at == NEVER:
                             continue
@@ -152,52 +164,50 @@ class Loop:
                 if at < end:
                     end = at
                     first = medium
-                    is_alone = True
                 elif at == end:
-                    is_alone = False
-            # the next instant: frames before wake-ups
-            if end <= wake:
-                if end > until:
-                    break
+                    is_shared = True
+            if end < bound and not first.is_watched:  # nearly always: a plain frame, and nobody to be woken
                 now = end
                 first.end = NEVER
-                row = first.on_wire
-                frame, sender = row
-                if first.is_watched or frame.flags:
-                    self._end(now, first)
-                    wake = self._first_wake()
-                else:
-                    ends.append(now)
-                    passed.append(row)
-                    can_id = frame.can_id
-                    for listener in sender.listeners:
-                        action = listener.filter[can_id]
-                        if action == PASS_ON:
-                            listener.counts[listener.port] += 1
-                            onward = listener.onward
-                            waiting = onward.waiting
-                            if waiting:
-                                listener.out.send(1 - listener.port, frame)
-                            else:
-                                waiting.append((frame, onward))
-                        elif action:
-                            node = listener.node
-                            node.receive(now, listener.port, frame, listener.out)
-                            if node.wake_at < wake:
-                                wake = node.wake_at
-                if not is_alone:
-                    for medium in media:
-                        if medium.end == now:
-                            medium.end = NEVER
-                            self._end(now, medium)
-                    wake = self._first_wake()
-                if wake <= now:
-                    wake = self._wake(now)
-            elif wake > until:
-                break
+                frame, sender = first.on_wire
+                ends.append(now)
+                frames.append(frame)
+                senders.append(sender)
+                can_id = NO_FILTER if frame.flags else frame.can_id
+                for listener in sender.listeners:
+                    action = listener.filter[can_id]
+                    if action == PASS_ON:
+                        listener.counts[listener.port] += 1
+                        onward = listener.onward
+                        waiting = onward.waiting
+                        if waiting:
+                            listener.out.send(1 - listener.port, frame)
+                        else:
+                            waiting.append((frame, onward))
+                    elif action:
+                        node = listener.node
+                        node.receive(now, listener.port, frame, listener.out)
+                        if node.wake_at < wake:
+                            wake = node.wake_at
+                            is_due = wake <= now
+                            bound = wake if wake <= until else until + 1
+                if not is_due and not is_shared:
+                    continue
             else:
-                now = wake
+                now = end if end < wake else wake
+                if now > until:
+                    break
+                is_shared = True
+            if is_shared:  # the other frames of this instant
+                for medium in media:
+                    if medium.end == now:
+                        medium.end = NEVER
+                        self._end(now, medium)
+                wake = self._first_wake()
+            is_shared = is_due = False
+            if wake <= now:
                 wake = self._wake(now)
+            bound = wake if wake <= until else until + 1
         self.now = until
 
     def _end(self, now: int, medium: Medium) -> None:
@@ -207,9 +217,14 @@ class Loop:
             wire.advance(now)
             return
         frame, sender = medium.on_wire
-        self._ends.append(now)
-        self._passed.append((frame, sender))
+        self._write(now, frame, sender)
         self._hear(now, frame, sender)
+
+    def _write(self, now: int, frame: Frame, sender: Port) -> None:
+        """A row of the trace."""
+        self._ends.append(now)
+        self._frames.append(frame)
+        self._senders.append(sender)
 
     def _hear(self, now: int, frame: Frame, sender: Port) -> None:
         """A frame has passed: everybody who listens takes it."""
@@ -219,8 +234,7 @@ class Loop:
     def serve(self, now: int, events: list[WireEvent]) -> None:
         """What a Wiring says has happened: rows of the trace, frames to those who accepted them, notices."""
         for event in events:
-            self._ends.append(now)
-            self._passed.append((event.frame, event.sender))
+            self._write(now, event.frame, event.sender)
             if event.state is not None:
                 self._notify(now, event.sender, event.state)
             elif event.ports is None:

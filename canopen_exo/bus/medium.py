@@ -16,7 +16,7 @@ from typing import Final, final
 from mypy_extensions import mypyc_attr
 
 from canopen_exo.bus.frame import FLAG_ERROR, FLAG_FD, Frame
-from canopen_exo.bus.node import MS, NEVER, SECOND, TAKE, ErrorState, Node, Out, PortState, Relay
+from canopen_exo.bus.node import MS, NEVER, SECOND, ErrorState, Node, Out, PortState, Relay, open_filter
 from canopen_exo.errors import CanopenExoError
 
 QUEUE_LENGTH: Final = 64
@@ -27,7 +27,7 @@ RESTART_NS: Final = 100 * MS
 """From bus-off to the request to restart (assumed; a common setting of `restart-ms` of Linux)."""
 
 _NOTHING: Final = Frame(0, b"")  # on the wire of a bus that was never used
-_EVERYTHING: Final = bytearray([TAKE]) * 0x800
+_EVERYTHING: Final = open_filter()
 _BUS_OFF: Final = ErrorState.BUS_OFF  # an enumeration is looked up slowly
 _DOWN: Final = ErrorState.DOWN
 
@@ -211,13 +211,12 @@ class Medium:
             port.dropped += 1
             return
         arbitration = frame.arbitration
-        while at:
-            other, rival = waiting[at - 1]
-            if other.arbitration <= arbitration:
-                if other.arbitration == arbitration and rival is not port:
-                    self.collisions += 1
-                break
+        while at and waiting[at - 1][0].arbitration > arbitration:
             at -= 1
+        if at:
+            other, rival = waiting[at - 1]
+            if other.arbitration == arbitration and rival is not port:
+                self.collisions += 1
         waiting.insert(at, (frame, port))
 
     def arbitrate(self, now: int) -> None:

@@ -61,7 +61,15 @@ class Out:
 IGNORE: Final = 0
 TAKE: Final = 1
 PASS_ON: Final = 2
-"""What becomes of a base data frame at an acceptance filter (`Node.filters`)."""
+"""What becomes of a frame at an acceptance filter (`Node.filters`)."""
+
+NO_FILTER: Final = 0x800
+"""Place in a filter of all frames but base data frames: TAKE."""
+
+
+def open_filter() -> bytearray:
+    """An acceptance filter that takes everything."""
+    return bytearray([TAKE]) * (NO_FILTER + 1)
 
 
 @mypyc_attr(allow_interpreted_subclasses=True)
@@ -69,8 +77,8 @@ class Node:
     """Something on a bus: a controller, a device, a rack of devices, a gateway.
 
     wake_at: absolute time [ns] of the next call to `wake`, NEVER for none; read afresh before every wait.
-    filters: acceptance filters, as a CAN controller has them: by port and 11-bit id, IGNORE where `receive` does nothing
-    with a base data frame, so that a loop need not call it, else TAKE; none at all for a node that takes everything.
+    filters: acceptance filters, as a CAN controller has them: by port and 11-bit id, IGNORE where `receive` does
+    nothing with a base data frame, so that a loop need not call it, else TAKE. Without any the node takes everything.
     The node may change what stands in them at any time, but not take others.
     """
 
@@ -106,4 +114,4 @@ class Relay(Node):
     def __init__(self) -> None:
         super().__init__()
         self.frames: list[int] = [0, 0]
-        self.filters = [bytearray([TAKE]) * 0x800, bytearray([TAKE]) * 0x800]
+        self.filters = [open_filter(), open_filter()]

@@ -8,8 +8,8 @@ processes of a rig share; only this module and the channels read it. Between two
 2. serves the wake-ups that are due; 3. delivers own frames to the node's other ports on a shared channel;
 4. sends what had to wait; 5. calls the further readers (live control).
 
-A Relay between two channels that carry records (SocketCAN) is served in the same order, but a frame it would only pass
-on goes as the record that came, and nothing is made of it. With a trace to keep, every frame is made and handled.
+A Relay between two channels that carry records (SocketCAN) is served in the same order, but frames it would only pass
+on go as the records that came (`shortcut`). With a trace to keep, every frame is made and handled.
 
 `now` never goes back for a frame: one whose stamp is older than what was served already gets that time (its trace row
 keeps the stamp). Deviation from the lock-step order: within one channel frames keep the order in which they came, also
@@ -25,16 +25,16 @@ import logging
 import select
 import time
 from collections.abc import Callable
-from operator import itemgetter
 from typing import Final, Protocol, final
 
-from canopen_exo.bus.channel import Arrival, Channel, RecordArrival, RecordChannel
+from canopen_exo.bus.channel import Arrival, Channel, RecordChannel
 from canopen_exo.bus.lateness import Lateness
 from canopen_exo.bus.losses import Losses
 from canopen_exo.bus.medium import Transmission
-from canopen_exo.bus.node import MS, NEVER, PASS_ON, SECOND, Node, PortState, Relay
+from canopen_exo.bus.node import MS, NEVER, SECOND, Node, PortState, Relay
 from canopen_exo.bus.realtime_out import Line, RealTimeOut
 from canopen_exo.bus.scheduling import request_fifo, sharpen_timers
+from canopen_exo.bus.shortcut import ShortCut
 from canopen_exo.errors import CanopenExoError
 
 __all__ = ["RECEIVED", "Lateness", "Readable", "RealTimeLoop", "RealTimeOut", "request_fifo"]
@@ -45,10 +45,11 @@ RECEIVED: Final = -1
 _CHECK_NS: Final = 50 * MS
 """`until` is asked at least this often."""
 
+_AWAKE_NS: Final = 10 * MS
+"""How long a loop that polls busily stays awake after the last thing to read: a cycle of a 100 Hz rig."""
+
 _RETRY_NS: Final = MS
 """How soon a frame is offered again to an interface that select cannot watch."""
-
-_BY_STAMP: Final = itemgetter(0)
 
 _LOG: Final = logging.getLogger(__name__)
 
@@ -78,7 +79,8 @@ class RealTimeLoop:
 
     channels: the interfaces, numbers in the trace; ports[k]: index of the channel of the node's port k, several ports
     may share one. epoch_ns: time 0 on CLOCK_MONOTONIC. record: keep the trace. measure_latency: keep `latency`.
-    clock, wait: for tests.
+    busy_poll: do not sleep until 10 ms after the last thing to read, which takes a core while frames come: waking up
+    takes a machine longer than passing a frame on. clock, wait: for tests.
     trace: every frame in the order served, received ones with their stamp and sender RECEIVED, own ones with the time
     of sending and the node's port. lateness: time served - wake_at of every wake-up. dropped: frames a full transmit
     queue refused, by port.
@@ -93,6 +95,7 @@ class RealTimeLoop:
         *,
         record: bool = False,
         measure_latency: bool = False,
+        busy_poll: bool = False,
         clock: Callable[[], int] = time.monotonic_ns,
         wait: Wait = wait_select,
     ) -> None:
@@ -113,7 +116,9 @@ class RealTimeLoop:
         )
         self._lines: Final[list[Line]] = []
         self._readers: Final[dict[int, Callable[[int], None]]] = {}
-        self._served: int = -NEVER
+        self._descriptors: list[int] = []
+        self._busy_poll: Final[bool] = busy_poll
+        self._awake_until: int = -NEVER
         for index, channel in enumerate(channels):
             channel.epoch_ns = epoch_ns
             self._lines.append(Line(index, channel))
@@ -122,9 +127,7 @@ class RealTimeLoop:
             self._out.lines.append(self._lines[index])
             self._out.dropped.append(0)
         self.dropped: Final[list[int]] = self._out.dropped
-        self._records: Final[list[RecordChannel]] = self._record_channels(node, ports)
-        self._relay: Final[Relay | None] = node if isinstance(node, Relay) and self._records else None
-        self._measure: Final[bool] = measure_latency
+        self._short_cut: Final[ShortCut | None] = self._find_short_cut(node, ports, measure_latency)
 
     @property
     def latency(self) -> list[Lateness]:
@@ -155,10 +158,12 @@ class RealTimeLoop:
     def add_reader(self, source: Readable, callback: Callable[[int], None]) -> None:
         """Call `callback(now)`, between two calls of the node, whenever `source` is readable."""
         self._readers[source.fileno()] = callback
+        self._watch()
 
     def remove_reader(self, source: Readable) -> None:
         """Wait for `source` no longer; to be called before it is closed."""
         self._readers.pop(source.fileno(), None)
+        self._watch()
 
     def run(self, until: Callable[[int], bool]) -> None:
         """Serve the node until `until(now)` is true. Channels stay open, they are the caller's."""
@@ -166,7 +171,7 @@ class RealTimeLoop:
         collecting = gc.isenabled()
         gc.disable()
         try:
-            while not until(self.now()):
+            while not until(self._clock() - self.epoch_ns):
                 self._turn()
         finally:
             for line in self._lines:
@@ -180,16 +185,18 @@ class RealTimeLoop:
 
     def _turn(self, longest_ns: int = _CHECK_NS) -> None:
         """Wait once, `longest_ns` at most, then serve everything that is due."""
-        readers = list(self._readers)
         writers: list[int] = []
-        timeout_ns = min(self._prepare(self.now(), readers, writers), longest_ns)
-        readable, writable = self._wait(readers, writers, timeout_ns / SECOND)
         now = self._clock() - self.epoch_ns
-        if self._relay is None:
-            self._serve_arrivals(now, readable)
-        else:
-            self._serve_records(self._relay, now, readable)
-        self._serve_wakes(now)
+        until = self._prepare(now, now + longest_ns, writers)
+        readable, writable = self._wait(self._descriptors, writers, (until - now) / SECOND)
+        now = self._clock() - self.epoch_ns
+        if readable and self._busy_poll:
+            self._awake_until = now + _AWAKE_NS
+        left = self._drain(now, readable) if self._short_cut is None else self._short_cut.serve(now, readable)
+        if left:
+            self._serve_arrivals(left)
+        if self._node.wake_at <= now:
+            self._serve_wakes(now)
         if self._out.echoes:
             self._serve_echoes()
         for line in self._lines:
@@ -201,18 +208,19 @@ class RealTimeLoop:
                 if callback is not None:
                     callback(self.now())
 
-    def _prepare(self, now: int, readers: list[int], writers: list[int]) -> int:
-        """Fill in what to wait for; returns for how long [ns]."""
-        at = now + _CHECK_NS
-        if self._node.wake_at < at:
-            at = self._node.wake_at
-        if self._out.echoes:
+    def _prepare(self, now: int, latest: int, writers: list[int]) -> int:
+        """Fill in what to wait for; returns until when, `latest` at most."""
+        at = self._node.wake_at
+        if at > latest:
+            at = latest
+        if self._out.echoes or now < self._awake_until:
             at = now
         for line in self._lines:
             channel = line.channel
-            fd = line.fd = channel.fileno()
-            if fd >= 0:
-                readers.append(fd)
+            fd = channel.fileno()
+            if fd != line.fd:
+                line.fd = fd
+                self._watch()
             if channel.poll_at < at:
                 at = channel.poll_at
             if line.waiting:
@@ -221,26 +229,34 @@ class RealTimeLoop:
                     writers.append(fd)
                 else:
                     at = min(at, send_at if send_at > now else now + _RETRY_NS)
-        return at - now if at > now else 0
+        return at if at > now else now
 
-    def _serve_arrivals(self, now: int, readable: list[int]) -> None:
-        """Drain the channels that have something and serve it in order."""
-        first: list[Arrival] = []
-        first_line = -1
-        batches: list[tuple[int, int, int, Arrival]] = []
+    def _watch(self) -> None:
+        """What to wait for has changed."""
+        self._descriptors = [*self._readers, *[line.fd for line in self._lines if line.fd >= 0]]
+
+    def _drain(self, now: int, readable: list[int]) -> list[list[Arrival]]:
+        """What has come, by channel."""
+        found: list[list[Arrival]] = []
         for line in self._lines:
             channel = line.channel
-            if (line.fd >= 0 and line.fd in readable) or channel.poll_at <= now:
-                arrivals = channel.receive()
-                if not arrivals:
-                    continue
-                if first_line < 0:  # one channel alone needs no merging
-                    first = arrivals
-                    first_line = line.index
-                    continue
-                if not batches:
-                    _number(batches, first_line, first)
-                _number(batches, line.index, arrivals)
+            is_due = (line.fd >= 0 and line.fd in readable) or channel.poll_at <= now
+            found.append(channel.receive() if is_due else [])
+        return found
+
+    def _serve_arrivals(self, found: list[list[Arrival]]) -> None:
+        """Serve what came on each channel in order."""
+        first_line = -1
+        batches: list[tuple[int, int, int, Arrival]] = []
+        for index, arrivals in enumerate(found):
+            if not arrivals:
+                continue
+            if first_line < 0:  # one channel alone needs no merging
+                first_line = index
+                continue
+            if not batches:
+                _number(batches, first_line, found[first_line])
+            _number(batches, index, arrivals)
         if first_line < 0:
             return
         latest = self.now()
@@ -250,67 +266,30 @@ class RealTimeLoop:
                 self._deliver(self._lines[index], arrival, latest)
         else:
             line = self._lines[first_line]
-            for arrival in first:
+            for arrival in found[first_line]:
                 self._deliver(line, arrival, latest)
 
-    def _record_channels(self, node: Node, ports: list[int]) -> list[RecordChannel]:
-        """The two channels of a Relay, where records can go from one to the other and no trace wants frames."""
+    def _find_short_cut(self, node: Node, ports: list[int], measure: bool) -> ShortCut | None:
+        """For a Relay, where records can go from one channel to the other and no trace wants frames."""
         if not isinstance(node, Relay) or self.trace is not None or ports != [0, 1] or len(self._lines) != 2:
-            return []
+            return None
         channels = [line.channel for line in self._lines]
         found = [channel for channel in channels if isinstance(channel, RecordChannel)]
-        return found if len(found) == 2 and type(found[0]) is type(found[1]) else []
-
-    def _serve_records(self, relay: Relay, now: int, readable: list[int]) -> None:
-        """As `_serve_arrivals`; what `relay` only passes on goes through here."""
-        found: list[RecordArrival] = []
-        place = -1
-        for channel in self._records:
-            place += 1
-            if self._lines[place].fd in readable or channel.poll_at <= now:
-                batch = channel.receive_records(place)
-                if found and batch:  # each is in order by itself; where stamps are equal the first channel comes first
-                    found += batch
-                    found.sort(key=_BY_STAMP)
-                elif batch:
-                    found = batch
-        for stamp, place, can_id, record, arrival in found:
-            if arrival is None:
-                if (
-                    relay.filters[place][can_id] == PASS_ON
-                    and relay.wake_at >= stamp
-                    and self._pass_on(stamp, 1 - place, record)
-                ):
-                    relay.frames[place] += 1
-                    continue
-                arrival = Arrival(stamp, self._records[place].frame_in(record), None)
-            self._deliver(self._lines[place], arrival, stamp)
-
-    def _pass_on(self, stamp: int, place: int, record: bytes) -> bool:
-        """Send a record on the channel `place`; False when it has to wait, as a frame."""
-        line = self._lines[place]
-        channel = self._records[place]
-        if line.waiting:
-            return False
-        lost = channel.lost
-        if not channel.send_record(record):
-            return False
-        if stamp > self._served:
-            self._served = stamp
-        if self._measure and channel.lost == lost:
-            line.latency.add(self._clock() - self.epoch_ns - stamp)
-        return True
+        if len(found) < 2 or type(found[0]) is not type(found[1]):
+            return None
+        clock = self.now if measure else None
+        return ShortCut(node, found, self._lines, self._out, self._deliver, clock)
 
     def _deliver(self, line: Line, arrival: Arrival, latest: int) -> None:
         """Give one arrival to the node. latest: no stamp counts as later than this, the time at which all had come."""
         now = arrival.stamp_ns
         if now > latest:
             now = latest
-        if now < self._served:
-            now = self._served
+        if now < self._out.served_ns:
+            now = self._out.served_ns
         if self._node.wake_at < now:
             self._serve_wakes(now - 1)
-        self._served = now
+        self._out.served_ns = now
         frame = arrival.frame
         if frame is not None:
             if self.trace is not None:
@@ -345,8 +324,8 @@ class RealTimeLoop:
         at = node.wake_at
         while at <= limit:
             self.lateness.add(self.now() - at)
-            if at > self._served:
-                self._served = at
+            if at > self._out.served_ns:
+                self._out.served_ns = at
             node.wake(at, self._out)
             if node.wake_at <= at:
                 raise CanopenExoError(
@@ -360,9 +339,9 @@ class RealTimeLoop:
         echoes = self._out.echoes
         self._out.echoes = []
         for echo in echoes:
-            now = max(echo.sent_ns, self._served)
+            now = max(echo.sent_ns, self._out.served_ns)
             self._serve_wakes(now - 1)
-            self._served = now
+            self._out.served_ns = now
             self._node.receive(now, echo.port, echo.frame, self._out)
 
 

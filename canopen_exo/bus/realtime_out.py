@@ -73,6 +73,7 @@ class Line:
 class RealTimeOut(Out):
     """The transmit side of the node. handled_ns: stamp of the frame being handled, NEVER outside of `receive`.
 
+    served_ns: the latest time that the node has been given, or that of a frame passed on in its stead.
     relay: what waits keeps its order, whatever its ids.
     """
 
@@ -83,6 +84,7 @@ class RealTimeOut(Out):
         self.echoes: list[Echo] = []
         self.dropped: Final[list[int]] = []
         self.handled_ns: int = NEVER
+        self.served_ns: int = -NEVER
         self._clock: Final = clock
         self._epoch_ns: Final[int] = epoch_ns
         self._trace: Final = trace

@@ -1,7 +1,8 @@
-"""Many records with one system call: recvmmsg(2), which Python's socket module does not have.
+"""Many records with one system call: recvmmsg(2) and sendmmsg(2), which Python's socket module does not have.
 
-Source: recvmmsg(2), recvmsg(2), cmsg(3); socket(7) for SO_TIMESTAMPNS and SO_RXQ_OVFL. ctypes lays the structures out
-for the machine at hand. Where the C library or the kernel has no recvmmsg, recvmsg gives the same, one record a call.
+Source: recvmmsg(2), sendmmsg(2), recvmsg(2), cmsg(3); socket(7) for SO_TIMESTAMPNS and SO_RXQ_OVFL. ctypes lays the
+structures out for the machine at hand. Where the C library or the kernel has no recvmmsg, recvmsg gives the same, one
+record a call; without sendmmsg nothing goes out from here, and the caller sends as it can.
 Leaves out: the senders' addresses, and what a datagram has beyond the 72 bytes of the longest CAN record.
 """
 
@@ -11,7 +12,7 @@ import os
 import socket
 import struct
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from typing import Final, final
 
@@ -27,6 +28,9 @@ SO_RXQ_OVFL: Final = 40
 _PLAIN_SIZE: Final = 16
 """linux/can.h: struct can_frame."""
 
+_LENGTH_AT: Final = 4
+"""linux/can.h: of the data length in both."""
+
 _CONTROL_SIZE: Final = 64
 """Bytes for control messages: a stamp (16 + 16) and a drop count (16 + 8), which comes only after a drop."""
 
@@ -35,14 +39,19 @@ _ALIGNED: Final = struct.calcsize("N")
 _TIME: Final = struct.Struct("@ll")  # timespec
 _COUNT: Final = struct.Struct("@I")
 _STAMP_SIZE: Final = _CONTROL_HEAD.size + _TIME.size
-_STAMP_AT: Final = _CONTROL_HEAD.size
-_FIRST_STAMP: Final = _TIME.unpack_from
-_STAMPS: Final = struct.Struct(f"@{_CONTROL_HEAD.size}xll{_CONTROL_SIZE - _STAMP_SIZE}x")
-_RECORDS: Final = struct.Struct(f"{_PLAIN_SIZE}s{RECORD_SIZE - _PLAIN_SIZE}x")
+_PLACE_SIZE: Final = RECORD_SIZE + _CONTROL_SIZE
+"""Where one message is read to: its record, its control messages behind it."""
+
+_FIRST: Final = struct.Struct(f"@IB{RECORD_SIZE - _LENGTH_AT - 1}x{_CONTROL_HEAD.size}xll").unpack_from
+_WORDS: Final = _PLACE_SIZE // struct.calcsize("I")
+_LONGS: Final = _PLACE_SIZE // struct.calcsize("l")
+_SECONDS_AT: Final = (RECORD_SIZE + _CONTROL_HEAD.size) // struct.calcsize("l")
 _SECOND: Final = 1_000_000_000
 
 _MISSING: Final = (errno.ENOSYS, errno.EPERM)
 """A kernel without the call, or a sandbox that refuses it."""
+
+_NOW: Final = getattr(socket, "MSG_DONTWAIT", 0)  # Windows has none, nor these calls
 
 Stamped = tuple[int, bytes]
 """The kernel's stamp [ns] on CLOCK_REALTIME, -1 without one; the record."""
@@ -82,7 +91,8 @@ class Receiver:
     """Reads from sockets that stamp what comes (SO_TIMESTAMPNS) and count what they drop (SO_RXQ_OVFL).
 
     count: records of the last `read`. is_plain: all of them are classical (16 bytes), stamped, and told of no drop;
-    `plain` and `stamps` have them then, `stamped` in any case. drops: the running total last told, -1 for none.
+    `record`, `ids`, `seconds` and `nanos` have them then, `stamped` in any case. views: of each plain record; outgoing:
+    the same for sendmmsg. drops: the running total last told, -1 for none.
     is_untold: with a record that was not plain there was more to tell, of drops, than there was room for.
     """
 
@@ -95,17 +105,23 @@ class Receiver:
         self._read_many: Callable[[], int] | None = None
         self._found: list[Stamped] = []  # of records that are not plain
         self._error: OSError | None = None
-        self._records: Final[bytearray] = bytearray(SLOTS * RECORD_SIZE)
-        self._controls: Final[bytearray] = bytearray(SLOTS * _CONTROL_SIZE)
-        self._first_record: Final = memoryview(self._records)[:_PLAIN_SIZE]
+        self._places: Final[bytearray] = bytearray(SLOTS * _PLACE_SIZE)
+        self._words: Final = memoryview(self._places).cast("I")
+        self._longs: Final = memoryview(self._places).cast("l")
+        self.views: Final = [
+            memoryview(self._places)[at : at + _PLAIN_SIZE] for at in range(0, SLOTS * _PLACE_SIZE, _PLACE_SIZE)
+        ]
         self._slots: Final = (_Slot * SLOTS)()
         self._vectors: Final = (_Vector * SLOTS)()
+        self._outgoing: Final = (_Slot * SLOTS)()
+        self._cut: Final = (_Vector * SLOTS)()
         self._slots_at: Final = ctypes.c_void_p(ctypes.addressof(self._slots))
         heads = memoryview(self._slots).cast("B")
         fresh = self._lay_out()
+        self.outgoing: Final = self._lay_out_again()
         # by the number of records: the heads; as they have to be before a call, and as plain records leave them, from
         # a bus and (MSG_DONTROUTE) from a socket of this machine
-        self._views: Final = [heads[: number * _SLOT_SIZE] for number in range(SLOTS + 1)]
+        self._heads: Final = [heads[: number * _SLOT_SIZE] for number in range(SLOTS + 1)]
         self._fresh: Final = _beginnings(fresh)
         self._plain: Final = _beginnings(_as_plain(fresh, 0))
         self._plain_local: Final = _beginnings(_as_plain(fresh, socket.MSG_DONTROUTE))
@@ -115,9 +131,9 @@ class Receiver:
         self.drops = -1
         self._socket = can
         self._error = None
-        call = find_recvmmsg()
+        call = find_call("recvmmsg", True)
         # all arguments made beforehand: converting them costs as much as the call
-        many = None if call is None else partial(call, can.fileno(), self._slots_at, SLOTS, socket.MSG_DONTWAIT, None)
+        many = None if call is None else partial(call, can.fileno(), self._slots_at, SLOTS, _NOW, None)
         self._read_many = many
 
     def read(self) -> int:
@@ -129,55 +145,71 @@ class Receiver:
         if count < 0:
             return self._fail()
         self.count = count
-        heads = self._views[count].tobytes()
+        heads = self._heads[count].tobytes()
         if heads == self._plain[count] or heads == self._plain_local[count]:
             self.is_plain = True  # and room is left for a stamp only: a drop count shows as truncated (MSG_CTRUNC)
         else:
             self.is_plain = False
-            self._views[count][:] = self._fresh[count]
+            self._heads[count][:] = self._fresh[count]
             self._take_apart(heads)
         return count
 
-    def first(self) -> tuple[bytes, int, int]:
-        """The first of plain records, with its stamp: seconds and nanoseconds of CLOCK_REALTIME."""
-        seconds, nanos = _FIRST_STAMP(self._controls, _STAMP_AT)
-        return self._first_record.tobytes(), seconds, nanos
+    def first(self) -> tuple[int, int, int, int]:
+        """Of the first of plain records: id, data length, and its stamp, seconds and nanoseconds of CLOCK_REALTIME."""
+        return _FIRST(self._places)
 
-    def plain(self) -> Iterator[tuple[bytes]]:
-        """The plain records, 16 bytes each."""
-        return _RECORDS.iter_unpack(memoryview(self._records)[: self.count * RECORD_SIZE])
+    def ids(self) -> list[int]:
+        """The first word of every plain record: id and flags."""
+        return self._words[: self.count * _WORDS : _WORDS].tolist()
 
-    def unpack(self, layout: struct.Struct) -> Iterator[tuple[int, int]]:
-        """Two fields of every plain record. layout: of `RECORD_SIZE` bytes."""
-        return layout.iter_unpack(memoryview(self._records)[: self.count * RECORD_SIZE])
+    def longest(self) -> int:
+        """The largest data length that a plain record claims to have."""
+        return max(self._places[_LENGTH_AT : self.count * _PLACE_SIZE : _PLACE_SIZE])
 
-    def stamps(self) -> Iterator[tuple[int, int]]:
-        """The stamps of the plain records: seconds and nanoseconds of CLOCK_REALTIME."""
-        return _STAMPS.iter_unpack(memoryview(self._controls)[: self.count * _CONTROL_SIZE])
+    def record(self, number: int) -> bytes:
+        """One of the plain records."""
+        return self.views[number].tobytes()
+
+    def seconds(self) -> list[int]:
+        """Of the stamps of the plain records, on CLOCK_REALTIME."""
+        return self._longs[_SECONDS_AT : self.count * _LONGS : _LONGS].tolist()
+
+    def nanos(self) -> list[int]:
+        """The rest of these stamps."""
+        return self._longs[_SECONDS_AT + 1 : self.count * _LONGS : _LONGS].tolist()
 
     def stamped(self) -> list[Stamped]:
         """All records of the last `read`, of whatever size."""
         if not self.is_plain:
             return self._found
         found = []
-        for (record,), (seconds, nanos) in zip(self.plain(), self.stamps(), strict=True):
-            found.append((seconds * _SECOND + nanos, record))
+        for number, (seconds, nanos) in enumerate(zip(self.seconds(), self.nanos(), strict=True)):
+            found.append((seconds * _SECOND + nanos, self.record(number)))
         return found
 
     def _lay_out(self) -> bytes:
         """Point every slot at its place; the heads as they have to be before a call."""
-        records = (ctypes.c_char * len(self._records)).from_buffer(self._records)
-        controls = (ctypes.c_char * len(self._controls)).from_buffer(self._controls)
+        places = (ctypes.c_char * len(self._places)).from_buffer(self._places)
         for number in range(SLOTS):
             vector = self._vectors[number]
-            vector.base = ctypes.addressof(records) + number * RECORD_SIZE
+            vector.base = ctypes.addressof(places) + number * _PLACE_SIZE
             vector.size = RECORD_SIZE
             message = self._slots[number].message
             message.vectors = ctypes.addressof(vector)
             message.vector_count = 1
-            message.control = ctypes.addressof(controls) + number * _CONTROL_SIZE
+            message.control = vector.base + RECORD_SIZE
             message.control_size = _CONTROL_SIZE
         return bytes(self._slots)
+
+    def _lay_out_again(self) -> list[ctypes.c_void_p]:
+        """The same places for sending: 16 bytes of each, no control messages."""
+        for number in range(SLOTS):
+            self._cut[number].base = self._vectors[number].base
+            self._cut[number].size = _PLAIN_SIZE
+            message = self._outgoing[number].message
+            message.vectors = ctypes.addressof(self._cut[number])
+            message.vector_count = 1
+        return [ctypes.c_void_p(ctypes.addressof(slot)) for slot in self._outgoing]
 
     def _take_apart(self, heads: bytes) -> None:
         """Records of any size, with any control messages."""
@@ -187,10 +219,11 @@ class Receiver:
             slot = _Slot.from_buffer_copy(heads, number * _SLOT_SIZE)
             if slot.message.flags & socket.MSG_CTRUNC:
                 self.is_untold = True
-            at = number * _CONTROL_SIZE
-            stamp = self._controls_in(self._controls[at : at + min(slot.message.control_size, _CONTROL_SIZE)])
-            at = number * RECORD_SIZE
-            self._found.append((stamp, bytes(self._records[at : at + slot.size])))
+            at = number * _PLACE_SIZE
+            controls_at = at + RECORD_SIZE
+            size = min(slot.message.control_size, _CONTROL_SIZE)
+            stamp = self._controls_in(self._places[controls_at : controls_at + size])
+            self._found.append((stamp, bytes(self._places[at : at + slot.size])))
 
     def _controls_in(self, controls: bytes | bytearray) -> int:
         """Note the drops told in these control messages (cmsg(3)); the stamp."""
@@ -245,6 +278,27 @@ class Receiver:
         return self.count
 
 
+@final
+class Sender:
+    """Sends plain records out of the buffers of a Receiver."""
+
+    def __init__(self) -> None:
+        self._send_many: Callable[..., int] | None = None
+
+    def attach(self, can: socket.socket) -> None:
+        """Send on this socket from now on. One of a class of its own may have its own way of sending, so none there."""
+        call = find_call("sendmmsg", False) if type(can) is socket.socket else None
+        self._send_many = None if call is None else partial(call, can.fileno())
+
+    def send(self, source: Receiver, start: int, end: int) -> int:
+        """Those of the plain records last read, without waiting; how many went. What stopped the next is not told."""
+        many = self._send_many
+        if many is None:
+            return 0
+        count = many(source.outgoing[start], end - start, _NOW)
+        return count if count > 0 else 0
+
+
 def _as_plain(fresh: bytes, flags: int) -> bytes:
     """The heads after a call that filled every slot with a plain record. flags: as the kernel sets them."""
     slots = (_Slot * SLOTS).from_buffer_copy(fresh)
@@ -260,8 +314,11 @@ def _beginnings(heads: bytes) -> list[bytes]:
     return [heads[: number * _SLOT_SIZE] for number in range(SLOTS + 1)]
 
 
-def find_recvmmsg() -> Callable[..., int] | None:
-    """The C library's function, which never waits and so keeps the interpreter's lock; None where there is none."""
+def find_call(name: str, tells_why: bool) -> Callable[..., int] | None:
+    """A function of the C library, None where it is not; it is not to wait, so it keeps the interpreter's lock.
+
+    tells_why: it leaves its error for `ctypes.get_errno`.
+    """
     if sys.platform != "linux":
         return None
-    return getattr(ctypes.PyDLL(None, use_errno=True), "recvmmsg", None)
+    return getattr(ctypes.PyDLL(None, use_errno=tells_why), name, None)

@@ -2,8 +2,9 @@
 
 Source: the kernel's Documentation/networking/can.rst; linux/can.h, linux/can/raw.h; socket(7). Records are the kernel's
 structures: can_frame (16 bytes) and canfd_frame (72 bytes), in the machine's byte order.
-All that waits, at most 64 frames, is read with one system call (`recvmmsg`); a frame sent costs one more; select is the
-loop's. A base data frame can go from interface to interface as the record that came, without a Frame made of it.
+All that waits, at most 64 frames, is read with one system call (`recvmmsg`); select is the loop's. Base data frames can
+go from interface to interface as the records that came, without a Frame made of them, and with one system call for many
+in a row; any other frame sent costs one more.
 An interface that goes down is reported, what is sent meanwhile is lost and counted, and the socket lives on by itself;
 one that disappears is opened again with a back-off of 20 ms to 1 s.
 The kernel begins to stamp a moment after the first socket of the machine asked for it; until then it stamps what is
@@ -19,11 +20,11 @@ import time
 from collections.abc import Callable
 from typing import Final, final
 
-from canopen_exo.bus.channel import Arrival, RecordArrival, RecordChannel, StampClock
+from canopen_exo.bus.channel import Arrival, RecordChannel, StampClock
 from canopen_exo.bus.error_frame import ERROR_FLAG, read_error_frame
 from canopen_exo.bus.frame import FLAG_BRS, FLAG_ESI, FLAG_EXTENDED, FLAG_FD, FLAG_REMOTE, Frame
 from canopen_exo.bus.node import MS, NEVER, SECOND, ErrorState, PortState
-from canopen_exo.bus.recvmmsg import SO_RXQ_OVFL, SO_TIMESTAMPNS, Receiver
+from canopen_exo.bus.recvmmsg import SO_RXQ_OVFL, SO_TIMESTAMPNS, Receiver, Sender
 from canopen_exo.errors import CanopenExoError
 
 CLASSICAL_SIZE: Final = 16
@@ -40,9 +41,6 @@ _HEAD: Final = struct.Struct("=IBBBB")  # id and flags, length, FD flags, reserv
 _HEAD_SIZE: Final = 8
 _CLASSICAL: Final = struct.Struct("=IBBBB8s")
 _FLEXIBLE: Final = struct.Struct("=IBBBB64s")
-_ID: Final = struct.Struct("=I")
-_LENGTH_AT: Final = 4
-_ID_LENGTH: Final = struct.Struct("=IB67x")
 
 # Not all of these are in Python's socket module; the values are those of asm-generic/socket.h (all but alpha, mips,
 # parisc and sparc), linux/sock_diag.h and linux/can/raw.h.
@@ -61,6 +59,9 @@ _RECEIVE_BUFFER: Final = 8 << 20
 _SEND_BUFFER: Final = 1
 """Asks for the kernel's minimum (4.6 kB, some six frames on their way): a full bus then shows as "not writable" before
 the interface's own queue is full (txqueuelen, 10 by default), for which select cannot wait."""
+
+_MANY: Final = 4
+"""From so many records on one call for all of them costs less than a call for each."""
 
 _AGAIN_NS: Final = MS // 4
 """When an interface's queue was full (ENOBUFS): two frame times at 1 Mbit/s."""
@@ -181,75 +182,89 @@ class SocketCanChannel(RecordChannel):
         self._open_socket: Final = open_socket
         self._stamps: Final = StampClock()
         self._receiver: Final = Receiver()
+        self._sender: Final = Sender()
+        self._found: list[Arrival] = []
         self._notices: list[PortState] = []
         self._state: PortState | None = None
         self._is_down: bool = False
         self._is_closed: bool = False
         self._drops: int = 0
         self._back_off_ns: int = _FIRST_BACK_OFF_NS
+        self._fd: int = -1
         self._socket: socket.socket | None = open_socket()
-        prepare_socket(self._socket)
-        self._receiver.attach(self._socket)
+        self._attach(self._socket)
 
     def fileno(self) -> int:
         """The socket; -1 while the interface is away."""
-        return -1 if self._socket is None else self._socket.fileno()
+        return self._fd
 
     def receive(self) -> list[Arrival]:
         """What the kernel holds, at most 64 frames at once (the rest stays readable); opens again what was away."""
-        arrivals: list[Arrival] = []
-        for stamp, _, _, record, arrival in self.receive_records(0):
-            arrivals.append(Arrival(stamp, decode(record), None) if arrival is None else arrival)
-        return arrivals
+        self.read()
+        return [self.arrival(number) for number in range(self.count)]
 
-    def receive_records(self, place: int) -> list[RecordArrival]:
-        """As `receive`, undecoded."""
+    def read(self) -> bool:
+        """As `receive`, kept."""
+        if self._found:
+            self._found = []
+        self.count = 0
         if self._socket is None and not self._is_closed:
             self._reopen(time.monotonic_ns() - self.epoch_ns)
+        receiver = self._receiver
         count = 0
         failure: OSError | None = None
         if self._socket is not None:
             try:
-                count = self._receiver.read()
+                count = receiver.read()
             except BlockingIOError:
                 pass
             except OSError as error:
                 failure = error
         now = self._stamps.begin(self.epoch_ns)  # not before reading: no stamp is later than now
-        found: list[RecordArrival] = []
-        if count and (self._is_down or not self._receiver.is_plain):
-            self._take_all(place, now, found)
-        elif count == 1:  # what a bus that is not crowded gives; a frame waits for this
-            record, seconds, nanos = self._receiver.first()
-            self._take(record, self._stamps.at(seconds * SECOND + nanos), place, found)
-        elif count:
-            self._take_plain(place, now, found)
+        if count and receiver.is_plain and not self._is_down and not self._notices and self._take_base(count):
+            self.count = count
+            return True
+        if count:
+            self._take_all(now)
         elif failure is not None:
             self._fail(failure, now)
         if self._notices:
-            self._hand_out(now, place, found)
+            self._hand_out(now)
         if self._socket is not None:
             self.poll_at = NEVER
-        return found
+        self.count = len(self._found)
+        return self.count == 0
 
-    def frame_in(self, record: bytes) -> Frame:
-        """The frame in the record of a base data frame."""
-        frame = decode(record)
-        assert frame is not None
-        return frame
+    def arrival(self, number: int) -> Arrival:
+        """One of those that `read` kept."""
+        if self._found:
+            return self._found[number]
+        return Arrival(self.stamps[number], decode(self._receiver.record(number)), None)
+
+    def send_run(self, source: RecordChannel, start: int, end: int) -> int:
+        """Straight from where `source` has read them to."""
+        can = self._socket
+        if can is None or self._is_down or not isinstance(source, SocketCanChannel):
+            return 0
+        sent = start
+        if end - start >= _MANY:
+            sent += self._sender.send(source._receiver, start, end)
+        try:
+            while sent < end:
+                can.send(source._receiver.views[sent])
+                sent += 1
+        except OSError:
+            pass
+        return sent - start
 
     def send(self, frame: Frame) -> bool:
         """Hand a frame to the kernel; False when its queue is full."""
-        return self.send_record(encode(frame))
-
-    def send_record(self, record: bytes) -> bool:
-        """As `send`, with the kernel's own record."""
         can = self._socket
         if can is None:
             self.lost += 1
             return True
         try:
-            can.send(record)
+            can.send(encode(frame))
         except BlockingIOError:
             self.send_at = 0
             return False
@@ -282,58 +297,58 @@ class SocketCanChannel(RecordChannel):
             self.count_overruns()
             self._socket.close()
             self._socket = None
+            self._fd = -1
 
-    def _take_plain(self, place: int, now: int, found: list[RecordArrival]) -> None:
-        """A batch of classical records with nothing else to tell: what nearly every batch is."""
+    def _attach(self, can: socket.socket) -> None:
+        """Read and send here from now on."""
+        prepare_socket(can)
+        self._receiver.attach(can)
+        self._sender.attach(can)
+        self._fd = can.fileno()
+
+    def _take_base(self, count: int) -> bool:
+        """Plain records that are base data frames, as nearly all are; False for any other."""
         receiver = self._receiver
-        clock = self._stamps
-        offset, last = clock.offset, clock.last
-        for (record,), (can_id, length), (seconds, nanos) in zip(
-            receiver.plain(), receiver.unpack(_ID_LENGTH), receiver.stamps(), strict=True
-        ):
-            stamp = seconds * SECOND + nanos - offset  # as StampClock.at
-            if stamp > now:
-                stamp = now
-            if stamp < last:
-                stamp = last
-            last = stamp
-            if can_id <= 0x7FF and length <= 8:
-                found.append((stamp, place, can_id, record, None))
-            else:
-                self._take(record, stamp, place, found)
-        clock.last = last
+        if count == 1:  # a frame alone, what a bus that is not crowded gives, waits for this
+            can_id, length, seconds, nanos = receiver.first()
+            if can_id > 0x7FF or length > 8:
+                return False
+            self.ids = [can_id]
+            self.stamps = [self._stamps.at(seconds * SECOND + nanos)]
+            return True
+        ids = receiver.ids()
+        if max(ids) > 0x7FF or receiver.longest() > 8:
+            return False
+        self.ids = ids
+        self.stamps = self._stamps.many(receiver.seconds(), receiver.nanos())
+        return True
 
-    def _take_all(self, place: int, now: int, found: list[RecordArrival]) -> None:
+    def _take_all(self, now: int) -> None:
         """A batch of any kind."""
         receiver = self._receiver
         for realtime_ns, record in receiver.stamped():
             stamp = now if realtime_ns < 0 else self._stamps.at(realtime_ns)
             if self._is_down:
                 self._note(ErrorState.ERROR_ACTIVE, "interface up", now)
-                self._hand_out(stamp, place, found)
-            self._take(record, stamp, place, found)
+                self._hand_out(stamp)
+            self._take(record, stamp)
         if receiver.drops >= 0:
             self._count_drops(receiver.drops)
         if receiver.is_untold:
             self.count_overruns()
 
-    def _take(self, record: bytes, stamp: int, place: int, found: list[RecordArrival]) -> None:
+    def _take(self, record: bytes, stamp: int) -> None:
         """One record of any kind."""
-        if len(record) == CLASSICAL_SIZE:
-            (can_id,) = _ID.unpack_from(record)
-            if can_id <= 0x7FF and record[_LENGTH_AT] <= 8:
-                found.append((stamp, place, can_id, record, None))
-                return
         frame = decode(record)
         if frame is not None:
-            found.append((stamp, place, -1, b"", Arrival(stamp, frame, None)))
+            self._found.append(Arrival(stamp, frame, None))
             return
         if len(record) == CLASSICAL_SIZE:
             can_id = _HEAD.unpack_from(record)[0]
             if can_id & ERROR_FLAG:
                 self.errors += 1
                 self._state = read_error_frame(can_id, record[_HEAD_SIZE:], self._state)
-                found.append((stamp, place, -1, b"", Arrival(stamp, None, self._state)))
+                self._found.append(Arrival(stamp, None, self._state))
                 return
         self.malformed += 1
 
@@ -354,6 +369,7 @@ class SocketCanChannel(RecordChannel):
                 self.count_overruns()
                 self._socket.close()
                 self._socket = None
+                self._fd = -1
             self._back_off_ns = _FIRST_BACK_OFF_NS
             self.poll_at = now
 
@@ -367,21 +383,20 @@ class SocketCanChannel(RecordChannel):
         self._notices.append(self._state)
         self.poll_at = now
 
-    def _hand_out(self, stamp: int, place: int, found: list[RecordArrival]) -> None:
+    def _hand_out(self, stamp: int) -> None:
         """The notices so far, as arrivals."""
         for state in self._notices:
-            found.append((stamp, place, -1, b"", Arrival(stamp, None, state)))
+            self._found.append(Arrival(stamp, None, state))
         self._notices = []
 
     def _reopen(self, now: int) -> None:
         """Try once; the next attempt comes after a longer time."""
         try:
             can = self._open_socket()
-            prepare_socket(can)
+            self._attach(can)
         except OSError:
             self.poll_at = now + self._back_off_ns
             self._back_off_ns = min(2 * self._back_off_ns, _LAST_BACK_OFF_NS)
             return
         self._socket = can
         self._drops = 0
-        self._receiver.attach(can)

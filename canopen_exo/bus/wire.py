@@ -5,26 +5,28 @@ An attempt to send goes through the bit engine only when something disturbs it, 
 bits, nobody is there to acknowledge, or a controller has not come to rest after an earlier error. All others are as on
 the ideal bus, with the counters brought up to date where one is not 0.
 
-Deviations. An attempt is worked out when it starts: a frame that is queued while error frames pass waits for their end,
-as it would, but one queued within the few bits in which an undisturbed node could already start waits with the others.
+Deviations. An attempt is worked out when it starts, and again from there on when something begins or ends to disturb it
+(`replan`). A frame that is queued while error frames pass waits for their end, as it would, but one queued within the
+few bits in which an undisturbed node could already start waits with the others.
 A frame is received at the end of its intermission, as everywhere in this project, also where a receiver accepts it and
-an error frame follows. What bus-off does to queued frames is what Linux does: the interface goes down, so the queue
-is emptied, and what is sent until the restart is lost (`Port.lost`).
+an error frame follows.
+Where an undisturbed frame is worked out again within its arbitration, those that lose it later count as receivers.
 Of the error frames of one attempt the trace shows the first error that somebody noticed.
 """
 
 from typing import Final, final
 
-from canopen_exo.bus.attempt import COUNT, END, ERROR, Step, steps_of
+from canopen_exo.bus.attempt import COUNT, END, ERROR, Step, controllers_of, put_back, steps_of
 from canopen_exo.bus.bit_engine import run, split
-from canopen_exo.bus.confinement import BUS_OFF_LIMIT, RX_SUCCESS, TX_SUCCESS, count, is_passive, state_of
+from canopen_exo.bus.confinement import RX_SUCCESS, TX_SUCCESS, count, is_passive
 from canopen_exo.bus.controller import IDLE, OFF, SUSPEND_LENGTH, Controller
-from canopen_exo.bus.disturbance import NO_ACK, Disruption, Disturbance
-from canopen_exo.bus.error_frame import write_bus_error, write_error_frame
-from canopen_exo.bus.frame import FLAG_ERROR, FLAG_EXTENDED, FLAG_REMOTE, Frame
+from canopen_exo.bus.disturbance import NO_ACK, Disruption, Disturbance, joined
+from canopen_exo.bus.error_frame import write_bus_error
+from canopen_exo.bus.error_states import ErrorStates
+from canopen_exo.bus.frame import FLAG_ERROR, Frame
 from canopen_exo.bus.medium import Medium, Port, WireEvent, Wiring
-from canopen_exo.bus.node import NEVER, ErrorState, Node, Out, PortState
-from canopen_exo.bus.recovery import Recovery
+from canopen_exo.bus.node import NEVER, ErrorState, Out
+from canopen_exo.bus.recovery import is_present
 
 MARGIN: Final = 64
 """Bits after the length of a frame that disturbances are asked about: for two error frames of the longest kind."""
@@ -35,20 +37,20 @@ LIMIT: Final = 4096
 _LONGEST_REST: Final = 32
 """Recessive bits after which every controller that sends nothing is at rest."""
 
-_CLOSED: Final = [(Frame(0x1FFFFFFF, b"", FLAG_EXTENDED | FLAG_REMOTE), Port(Medium("none", 0, 1), Node(), 0))]
-"""The queue of a port that is bus-off: nothing can be put behind what is in it."""
-
-
-def is_present(port: Port) -> bool:
-    """It takes part: neither bus-off nor away."""
-    return port.state is not ErrorState.BUS_OFF and port.state is not ErrorState.DOWN
+_STATE: Final = (
+    "disturbances", "sink", "wake_at", "attempts", "spans",
+    "_started_ns", "_disruptions", "_initial", "_engaged", "_steps", "_done", "_unsettled", "_free_ns",
+    "_states", "_suspects", "_sent", "_is_noticed", "_is_charged", "_is_calm", "_is_stale",
+)  # fmt: skip
+"""What `__reduce__` copies besides the medium, which need not be whole yet."""
 
 
 @final
 class Wire(Wiring):
     """Errors on one medium. disturbances: what disturbs it, asked in this order; may be added to between two calls.
 
-    attempts: those that went through the bit engine.
+    attempts: those that went through the bit engine; spans: when each of them began and ended [ns], its error frames
+    included.
     """
 
     def __init__(self, medium: Medium, disturbances: list[Disturbance]) -> None:
@@ -56,18 +58,24 @@ class Wire(Wiring):
         self.medium: Final[Medium] = medium
         self.disturbances: Final[list[Disturbance]] = disturbances
         self.attempts: int = 0
+        self.spans: list[tuple[int, int]] = []
         self._started_ns: int = 0
-        self._steps: list[Step] = []
+        self._disruptions: list[Disruption] = []
+        self._initial: list[Controller] = []
         self._engaged: list[Controller] = []
+        self._steps: list[Step] = []
+        self._done: int = 0
         self._unsettled: list[Controller] = []
         self._free_ns: int = 0
-        self._recoveries: list[Recovery] = []
-        self._absent: int = 0
-        self._suspects: list[Disturbance] = []
+        self._states: ErrorStates = ErrorStates(medium)
+        self._suspects: list[tuple[Disturbance, int]] = []
         self._sent: Frame | None = None
+        self._is_noticed: bool = False
         self._is_charged: bool = False
         self._is_calm: bool = True
-        self._plan_wake(0)
+        self._is_stale: bool = False
+        for disturbance in disturbances:
+            self.wake_at = min(self.wake_at, disturbance.next_ns(1))
 
     # --- begin ---------------------------------------------------------------------------------------------------
 
@@ -83,7 +91,7 @@ class Wire(Wiring):
                 first = offer
                 break
             if first is None and not medium.is_restless:
-                self._plan_wake(now)
+                self._plan_wake(now + 1)
                 return
         frame: Frame | None = None
         bits, sender = 0, -1
@@ -105,22 +113,23 @@ class Wire(Wiring):
         medium.on_wire = first
         medium.end = now + bits * medium.bit_ns
         medium.is_watched = self._is_charged or not self._is_calm
+        self._started_ns = now
 
     def _ask(self, now: int, until: int, frame: Frame | None, sender: int) -> list[Disruption]:
-        """What disturbs the next attempt; who does is noted."""
+        """What disturbs the next attempt; who does is noted, and from which bit on."""
         disruptions: list[Disruption] = []
         self._suspects = []
         for disturbance in self.disturbances:
             found = disturbance.errors(now, until, self.medium.bit_ns, frame, sender)
             if found:
                 disruptions.extend(found)
-                self._suspects.append(disturbance)
+                self._suspects.append((disturbance, min([one.first for one in found])))
         return disruptions
 
     def _is_contested(self, first: tuple[Frame, Port]) -> bool:
         """Nobody is there to acknowledge, or another port begins with the same arbitration bits."""
         medium = self.medium
-        if len(medium.ports) - self._absent < 2:
+        if len(medium.ports) - self._states.absent < 2:
             return True
         frame, port = first
         for other, rival in medium.waiting:
@@ -153,8 +162,7 @@ class Wire(Wiring):
     def _settle(self, now: int) -> None:
         """The bus was idle until `now`: what came of it for those who had to wait for that."""
         bit_ns = self.medium.bit_ns
-        for recovery in self._recoveries:
-            recovery.count(self._free_ns, now, bit_ns)
+        self._states.hear(self._free_ns, now)
         idle = min((now - self._free_ns) // bit_ns, _LONGEST_REST)
         unsettled: list[Controller] = []
         for controller in self._unsettled:
@@ -163,7 +171,7 @@ class Wire(Wiring):
             if controller.state != IDLE:
                 unsettled.append(controller)
         self._unsettled = unsettled
-        calm = not unsettled and not self._recoveries
+        calm = not unsettled and not self._states.recoveries
         for port in self.medium.ports:
             calm = calm and port.ready_ns <= now
         self._is_calm = calm
@@ -172,48 +180,50 @@ class Wire(Wiring):
 
     def _attempt(self, now: int, offers: list[tuple[Frame, Port]], disruptions: list[Disruption]) -> None:
         medium = self.medium
-        controllers = split(self._controllers(offers), disruptions)
-        bits = run(controllers, disruptions, LIMIT)
         self.attempts += 1
-        self._engaged = controllers
+        self._initial = controllers_of(offers, self._unsettled, medium.ports)
         self._sent = offers[0][0] if offers else None
         self._started_ns = now
-        steps = steps_of(controllers, bits, medium.ports)
-        self._steps = steps
+        self._done = 0
+        self._is_noticed = False
         if offers:
             medium.on_wire = offers[0]
         medium.is_watched = True
         medium.is_restless = False
-        medium.end = self._time(steps[0])
+        self._work_out(disruptions)
+        medium.end = self._time(self._steps[0])
 
-    def _controllers(self, offers: list[tuple[Frame, Port]]) -> list[Controller]:
-        """Senders first, then receivers; those that have not come to rest go on from where they were."""
-        controllers: list[Controller] = []
-        known = 0
-        sending = 0
-        for _, port in offers:
-            sending |= 1 << port.number
-        for controller in self._unsettled:
-            others = [number for number in controller.ports if not sending >> number & 1]
-            if others:
-                controllers.append(controller.part(others))
-            for number in controller.ports:
-                known |= 1 << number
-        for frame, port in offers:
-            sender = Controller([port.number], port.tec, port.rec)
-            for controller in self._unsettled:
-                if port.number in controller.ports:
-                    sender = controller.part([port.number])
-            sender.send(frame)
-            controllers.insert(0, sender)
-            known |= 1 << port.number
-        alike: dict[tuple[int, int], list[int]] = {}
-        for port in self.medium.ports:
-            if not known >> port.number & 1 and is_present(port):
-                alike.setdefault((port.tec, port.rec), []).append(port.number)
-        for counters, numbers in alike.items():
-            controllers.append(Controller(numbers, counters[0], counters[1]))
-        return controllers
+    def _work_out(self, disruptions: list[Disruption]) -> None:
+        """The attempt from its start, so disturbed; of its steps those are left that have not happened yet."""
+        self._disruptions = disruptions
+        self._engaged = split([one.part(one.ports) for one in self._initial], disruptions)
+        bits = run(self._engaged, disruptions, LIMIT)
+        self._steps = steps_of(self._engaged, bits, self.medium.ports)[self._done :]
+
+    def _work_out_again(self, now: int) -> None:
+        """Something has begun or ended to disturb the bus: what is under way may go on in another way from here."""
+        medium = self.medium
+        is_plain = not self._steps
+        frame, port = medium.on_wire
+        if medium.end == NEVER or (is_plain and not is_present(port)):
+            return
+        known = self._suspects
+        until = max(self._started_ns + frame.bits * medium.bit_ns, now) + MARGIN * medium.bit_ns
+        if is_plain or self._sent is not None:
+            found = self._ask(self._started_ns, until, frame, port.number)
+        else:
+            found = self._ask(self._started_ns, until, None, -1)
+        self._suspects = known + [one for one in self._suspects if one not in known]
+        before = [] if is_plain else self._disruptions
+        found = joined(before, found, (now - self._started_ns) // medium.bit_ns)
+        if found == before:
+            return
+        if is_plain:
+            put_back(medium.waiting, frame, port)
+            self._attempt(self._started_ns, [(frame, port)], found)
+        else:
+            self._work_out(found)
+        medium.end = max(self._time(self._steps[0]), now)
 
     def _time(self, step: Step) -> int:
         return self._started_ns + (step.at + 1) * self.medium.bit_ns
@@ -228,8 +238,9 @@ class Wire(Wiring):
             self._passed(now, events)
         while self._steps and self._time(self._steps[0]) <= now:
             step = self._steps.pop(0)
+            self._done += 1
             if step.kind == COUNT:
-                self._count(now, step.port, step.tec, step.rec, events)
+                self._states.count(now, step.port, step.tec, step.rec, events)
             elif step.kind == ERROR and step.error is not None:
                 medium.errors += 1
                 self._blame(now)
@@ -246,15 +257,20 @@ class Wire(Wiring):
         else:
             medium.is_watched = False
             self._free_ns = now
-            self._finish_recoveries(now, events)
+            self._states.finish(now, self._free_ns, events)
             self._plan_wake(now)
         self.sink.happened(now, events)
 
     def _blame(self, now: int) -> None:
-        """Tell those that disrupted bits of this attempt that it was noticed."""
+        """Tell those that disrupted bits of this attempt that it was noticed, once."""
         suspects, self._suspects = self._suspects, []
-        for disturbance in suspects:
-            disturbance.disturbed(now, self._sent)
+        if not self._is_noticed:
+            self._is_noticed = True
+            told: list[Disturbance] = []
+            for disturbance, first in suspects:
+                if self._started_ns + first * self.medium.bit_ns < now and disturbance not in told:
+                    told.append(disturbance)
+                    disturbance.disturbed(now, self._sent)
 
     def _passed(self, now: int, events: list[WireEvent]) -> None:
         """A frame has passed undisturbed: the counters fall."""
@@ -264,19 +280,20 @@ class Wire(Wiring):
             if port is sender:
                 if port.tec:
                     tec, rec = count(TX_SUCCESS, port.tec, port.rec)
-                    self._count(now, port, tec, rec, events)
+                    self._states.count(now, port, tec, rec, events)
                 if is_passive(port.tec, port.rec):
                     port.ready_ns = now + SUSPEND_LENGTH * medium.bit_ns
                     self._is_calm = False
             elif port.rec and is_present(port):
                 tec, rec = count(RX_SUCCESS, port.tec, port.rec)
-                self._count(now, port, tec, rec, events)
+                self._states.count(now, port, tec, rec, events)
         self._weigh()
         events.append(WireEvent(frame, sender, None))
 
     def _ended(self, now: int) -> None:
         """The attempt is over: frames that were sent leave their queues, the others stay."""
         medium = self.medium
+        self.spans.append((self._started_ns, now))
         unsettled: list[Controller] = []
         for controller in self._engaged:
             port = medium.ports[controller.ports[0]]
@@ -318,30 +335,7 @@ class Wire(Wiring):
                 self._is_charged = True
                 return
 
-    # --- error states ----------------------------------------------------------------------------------------------
-
-    def _count(self, now: int, port: Port, tec: int, rec: int, events: list[WireEvent]) -> None:
-        """New counters of a port, and what follows from them."""
-        cause = "transmit errors" if tec > port.tec else "receive errors" if rec > port.rec else "frames without error"
-        port.tec, port.rec = tec, rec
-        state = state_of(tec, rec)
-        if state is not port.state and is_present(port):
-            self._change(port, state, cause, events)
-            if state is ErrorState.BUS_OFF:
-                self._go_off(now, port)
-
-    def _change(self, port: Port, state: ErrorState, cause: str, events: list[WireEvent]) -> None:
-        restarted = port.state is ErrorState.BUS_OFF
-        port.state = state
-        notice = PortState(port.number, state, port.tec, port.rec, cause)
-        can_id, data = write_error_frame(notice, restarted)
-        events.append(WireEvent(Frame(can_id, data, FLAG_ERROR), port, [], notice))
-
-    def _go_off(self, now: int, port: Port) -> None:
-        """Bus-off: nothing is sent or received until the restart; what waits is lost."""
-        self._close(port)
-        if port.restart_ns != NEVER:
-            self._recoveries.append(Recovery(port, now + port.restart_ns))
+    # --- error states and disturbances, from outside ----------------------------------------------------------------
 
     @property
     def is_plain(self) -> bool:
@@ -362,68 +356,37 @@ class Wire(Wiring):
         """Make a port bus-off, whatever its counters; it restarts as from any bus-off."""
         if is_present(port):
             events: list[WireEvent] = []
-            port.tec = BUS_OFF_LIMIT
-            self._change(port, ErrorState.BUS_OFF, "switched off", events)
-            self._go_off(now, port)
+            self._states.switch_off(now, port, events)
+            self._is_calm = False
             self.medium.is_watched = self.medium.end != NEVER
-            self._plan_wake(now)
+            self._plan_wake(now + 1)
             self.sink.happened(now, events)
 
     def restart(self, now: int, port: Port, delay_ns: int = 0) -> None:
         """Ask a port that is bus-off, and was not asked yet, to restart in `delay_ns`, whatever its `restart_ns`."""
-        for recovery in self._recoveries:
-            if recovery.port is port:
-                return
         if port.state is ErrorState.BUS_OFF:
-            self._recoveries.append(Recovery(port, now + delay_ns))
+            self._states.request(port, now + delay_ns)
             self._is_calm = False
-            self._plan_wake(now)
+            self._plan_wake(now + 1)
 
     def replan(self, now: int) -> None:
-        """A disturbance has begun or ended: ask to be woken for it. Whoever calls sees to it that the loop notices."""
-        self._plan_wake(now)
+        """A disturbance has begun or ended: look at it as soon as the nodes are woken at `now`.
+
+        Whoever calls sees to it that the loop notices.
+        """
+        self._is_stale = True
+        self.wake_at = now
 
     def disconnect(self, now: int, port: Port) -> None:
         """Its node is unplugged: what waits is lost, and nobody acknowledges there any more."""
-        if is_present(port):
-            self._close(port)
-        self._recoveries = [one for one in self._recoveries if one.port is not port]
-        port.state = ErrorState.DOWN
-        self._plan_wake(now)
+        self._states.unplug(port)
+        self._is_calm = False
+        self._plan_wake(now + 1)
 
     def connect(self, now: int, port: Port) -> None:
         """A node is plugged in where one was unplugged."""
         if port.state is ErrorState.DOWN:
-            self._open(now, port)
-            port.state = ErrorState.ERROR_ACTIVE
-
-    def _close(self, port: Port) -> None:
-        waiting = self.medium.waiting
-        kept = [entry for entry in waiting if entry[1] is not port]
-        port.lost += len(waiting) - len(kept)
-        waiting[:] = kept
-        port.waiting = _CLOSED
-        self._absent += 1
-        self._is_calm = False
-
-    def _open(self, now: int, port: Port) -> None:
-        port.tec = port.rec = 0
-        port.ready_ns = now
-        port.waiting = self.medium.waiting
-        self._absent -= 1
-
-    def _finish_recoveries(self, now: int, events: list[WireEvent]) -> None:
-        """Restart the ports that have seen enough recessive bits; the bus is idle."""
-        bit_ns = self.medium.bit_ns
-        left: list[Recovery] = []
-        for recovery in self._recoveries:
-            if recovery.done_ns(self._free_ns, bit_ns) > now:
-                left.append(recovery)
-                continue
-            port = recovery.port
-            self._open(now, port)
-            self._change(port, ErrorState.ERROR_ACTIVE, "controller restarted", events)
-        self._recoveries = left
+            self._states.plug(now, port)
 
     # --- timers ----------------------------------------------------------------------------------------------------
 
@@ -431,11 +394,14 @@ class Wire(Wiring):
         """A port leaves bus-off, a frame was put off until now, or something disturbs an idle bus."""
         medium = self.medium
         events: list[WireEvent] = []
+        if self._is_stale:
+            self._is_stale = False
+            self._work_out_again(now)
         if medium.end == NEVER:
-            self._finish_recoveries(now, events)
+            self._states.finish(now, self._free_ns, events)
             if not medium.waiting and not medium.is_restless and not medium.is_cut:
                 self._disturb(now)
-        self._plan_wake(now)
+        self._plan_wake(now + 1)
         if events:
             self.sink.happened(now, events)
 
@@ -444,24 +410,27 @@ class Wire(Wiring):
         bit_ns = self.medium.bit_ns
         disruptions = self._ask(now, now + MARGIN * bit_ns, None, -1)
         for disruption in disruptions:
-            if disruption.kind != NO_ACK and len(self.medium.ports) > self._absent:
+            is_now = disruption.kind != NO_ACK and disruption.first == 0
+            if is_now and len(self.medium.ports) > self._states.absent:
                 self._settle(now)
                 self._attempt(now, [], disruptions)
                 return
 
-    def _plan_wake(self, now: int) -> None:
+    def _plan_wake(self, first: int) -> None:
+        """Ask to be woken at `first` or later."""
         medium = self.medium
+        if self._is_stale:
+            return
         at = NEVER
         if medium.end == NEVER:
-            for recovery in self._recoveries:
-                at = min(at, recovery.done_ns(self._free_ns, medium.bit_ns))
+            at = self._states.next_ns(self._free_ns)
             if not self._is_calm:
                 for _, port in medium.waiting:
-                    at = min(at, port.ready_ns if port.ready_ns > now else NEVER)
-        after = now + 1 if medium.end == NEVER else medium.end
+                    at = min(at, port.ready_ns if port.ready_ns >= first else NEVER)
+        after = first if medium.end == NEVER else medium.end
         for disturbance in self.disturbances:
             at = min(at, disturbance.next_ns(after))
-        self.wake_at = at if at > now else now + 1
+        self.wake_at = max(at, first)
 
     def abort(self) -> None:
         """The attempt under way leads to nothing more; who had not come to rest does so while the bus is cut."""
@@ -469,3 +438,6 @@ class Wire(Wiring):
         self._engaged = []
         self._unsettled = []
         self.medium.is_restless = False
+
+    def __reduce__(self) -> tuple[type["Wire"], tuple[Medium, list[Disturbance]], dict[str, object]]:
+        return Wire, (self.medium, []), {name: getattr(self, name) for name in _STATE}

@@ -83,6 +83,10 @@ class FaultSpec(SpecModel):
         """What happens to the target: "held at its last value"."""
         raise NotImplementedError
 
+    def doubts(self) -> str:
+        """Why it changes nothing: "factor is 1"; "" when it does."""
+        return ""
+
 
 def raw_value(given: str | int | float, signal: Signal, key: str = "value") -> int:
     """The raw integer of a value written for that signal, not yet checked for range; raises SpecError at `key`."""

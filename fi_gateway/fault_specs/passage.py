@@ -50,6 +50,13 @@ class DropSpec(FaultSpec):
         length = f", bad for {1 / self.r:.3g} frames on average" if self.r else ""
         return f"lost in bursts ({100 * share:.3g} % of the frames{length})"
 
+    def doubts(self) -> str:
+        """Where no frame can get lost."""
+        if self.p is None or self.r is None:
+            return "probability is 0" if self._probability() == 0 else ""
+        good, bad = self._losses()
+        return "it loses no frame in either state" if self.p * bad + self.r * good == 0 else ""
+
     def _probability(self) -> float:
         return 1.0 if self.probability is None else self.probability
 

@@ -48,6 +48,10 @@ class BiasSpec(FaultSpec):
         """For people."""
         return f"shifted by {self.value}"
 
+    def doubts(self) -> str:
+        """With 0."""
+        return "" if _NOT_ZERO.match(str(self.value)) else "value is 0"
+
 
 @dataclass(frozen=True, slots=True)
 class GainSpec(FaultSpec):
@@ -63,6 +67,10 @@ class GainSpec(FaultSpec):
     def words(self, place: Place) -> str:
         """For people."""
         return f"multiplied by {self.factor:g}"
+
+    def doubts(self) -> str:
+        """With 1."""
+        return "factor is 1" if self.factor == 1 else ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +91,10 @@ class DriftSpec(FaultSpec):
     def words(self, place: Place) -> str:
         """For people."""
         return f"drifts by {self.slope}"
+
+    def doubts(self) -> str:
+        """With 0."""
+        return "" if _NOT_ZERO.match(str(self.slope)) else "slope is 0"
 
 
 @dataclass(frozen=True, slots=True)

@@ -48,7 +48,7 @@ class BitErrorSpec(WireFaultSpec):
             there = f"bits 0..{bits - 1}" if bits else "no bits"
             raise SpecError(("bit",), f"there is no bit {self.bit}; {self.field} of {place.words} has {there}")
         receivers = _mask(self.receivers, place)
-        return Disturbed(place.wire, BitError(self.field, self.bit, receivers, place.cob_ids, 0, place.senders))
+        return Disturbed(place.wire, BitError(self.field, self.bit, receivers, place.cob_ids, place.senders))
 
     def words(self, place: Place) -> str:
         """For people."""

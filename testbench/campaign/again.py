@@ -6,7 +6,7 @@ from pathlib import Path
 
 from testbench.campaign.execute import Workshop, make_run
 from testbench.campaign.identity import code_version, with_seed
-from testbench.campaign.records import NO_STATEMENT, RunRow, RunSpec, Wanted
+from testbench.campaign.records import IN_REAL_TIME, NO_STATEMENT, RunRow, RunSpec, Wanted
 from testbench.campaign.store import Store
 from testbench.errors import BenchError
 from testbench.store import check_folder
@@ -74,6 +74,11 @@ def make_again(store: Store, name: str, out: Path | None, say: Callable[[str], N
     """Make the run; says what stands in the way of its being the same. Raises BenchError."""
     before = find_run(store, name)
     recipe = store.runs.recipe(before.identity)
+    if IN_REAL_TIME in recipe.code_version:
+        raise BenchError(
+            f"run {name!r}: it was made {recipe.code_version.partition(' ')[2]}, and no run against the clock comes "
+            "again bit for bit; `traces: always` in the campaign file keeps a result folder of every run"
+        )
     number = next(number for number, point in store.points.all().items() if point == before.point)
     folder = out or Path("results") / f"{store.meta('name')}-{number}-{before.number}"
     check_folder(folder)

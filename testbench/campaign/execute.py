@@ -67,7 +67,7 @@ class Workshop:
         room for a new one.
         """
         found = self._golden.pop(params, None)
-        if found is None or (fork and not found.snapshots):
+        if found is None or (fork and not found.has_snapshots):
             found = Trunk(params, fork)
             self.made += 1
             while len(self._golden) >= GOLDEN_KEPT:
@@ -105,7 +105,8 @@ def make_run(spec: RunSpec, workshop: Workshop) -> RunRow:
     except (BenchError, JointEmulatorError, CanopenExoError) as error:
         row = RunRow(spec.identity, spec.wanted.point, spec.wanted.number, spec.seed, Outcome.INVALID, str(error))
     else:
-        row = _judged(spec, scenario, made, judgement)
+        pair = Pair(made.golden.record, made.golden.trace_hash, made.record, made.trace_hash, made.forked_s)
+        row = judged(spec, scenario, pair, judgement)
         if spec.keep_traces == "always" or (spec.keep_traces == "failures" and row.outcome in FAILURES):
             _keep(Path(spec.folder), scenario, made, time.perf_counter() - wall)
     return replace(
@@ -173,17 +174,28 @@ def _driven(rig: Rig, stop: FailureStop | None) -> tuple[RunRecord, int]:
     return replace(record, completed=rig.controller.phase is Phase.MOTION), rig.loop.now
 
 
-def _judged(spec: RunSpec, scenario: Scenario, made: Made, judgement: Judgement) -> RunRow:
+@dataclass(frozen=True, slots=True)
+class Pair:
+    """Golden and faulted run, one record where no fault acted; hashes of traces; time not simulated for it [s]."""
+
+    golden: RunRecord
+    golden_hash: str
+    faulted: RunRecord
+    trace_hash: str
+    forked_s: float = 0.0
+
+
+def judged(spec: RunSpec, scenario: Scenario, pair: Pair, judgement: Judgement) -> RunRow:
     """The row of a run that could be judged; also of one that proves nothing, which has no metrics then."""
-    record, wanted = made.record, spec.wanted
+    record, wanted = pair.faulted, spec.wanted
     starts = [(one.start_ns - record.time0_ns) / 1e9 for one in record.activations]
     start_s = min(starts, default=None)
     detected_s = None if start_s is None else first_reaction(record, start_s)
     names = tuple(joint.name for joint in scenario.plan.joints)
     worst = severity(names, {name: limits_of(name) for name in names}, record.truth, record.duration_s)
     outcome = outcome_of(judgement, record.source, detected_s)
-    reasons = [f"golden run: {one}" for one in made.golden.record.invalid_reasons]
-    if record is not made.golden.record:
+    reasons = [f"golden run: {one}" for one in pair.golden.invalid_reasons]
+    if record is not pair.golden:
         reasons += record.invalid_reasons
     reasons += [f"golden run: {one.joint} leaves its range without a fault" for one in judgement.golden_failures]
     return RunRow(
@@ -209,10 +221,10 @@ def _judged(spec: RunSpec, scenario: Scenario, made: Made, judgement: Judgement)
         errors=len(judgement.errors),
         failures=len(judgement.failures),
         failures_at_3deg=len(judgement.failures_at_3deg),
-        golden_hash=made.golden.trace_hash,
-        trace_hash=made.trace_hash,
+        golden_hash=pair.golden_hash,
+        trace_hash=pair.trace_hash,
         injections=tuple(_injection(one, record.time0_ns) for one in record.activations),
-        forked_s=made.forked_s,
+        forked_s=pair.forked_s,
     )
 
 

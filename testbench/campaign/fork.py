@@ -9,7 +9,7 @@ The first activation is found with the engine itself: a gateway with the injecto
 at their times and woken when it asks for it; what it sends goes nowhere. Only frames that it looks at are shown
 (`Relay.filters`). Fresh injectors are then brought to the instant of the copy in the same way, so that their random
 streams, held values and counters stand exactly where those of a straight run would.
-Left out: wire faults. They change the bus itself, from power-up on; such runs are made straight.
+Left out, and made straight: wire faults, which change the bus itself from power-up on; a core that is compiled.
 """
 
 import copy
@@ -21,6 +21,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from canopen_exo.bus import loop
 from canopen_exo.bus.frame import Frame
 from canopen_exo.bus.medium import Transmission
 from canopen_exo.bus.node import MS, NEVER, PASS_ON, Out
@@ -35,6 +36,12 @@ from testbench.run import chunks, record_of
 
 SNAPSHOT_NS: Final = 200 * MS
 """Distance of the copies: whole multiples of the loop's chunks, so that a branch ends where a straight run does."""
+
+MOST_SNAPSHOTS: Final = 64
+"""About as many; 0.7 MB each (measured). In a longer run they lie further apart, in multiples of SNAPSHOT_NS."""
+
+CAN_COPY: Final = (loop.__file__ or "").endswith(".py")
+"""A core compiled by mypyc cannot be copied yet: its classes cannot be made without their arguments."""
 
 Indices = NDArray[np.int64]
 
@@ -59,15 +66,18 @@ class Snapshot:
 class Trunk:
     """A finished golden run. record: of it; end_ns: when it was over, loop's clock; trace_hash: of both buses.
 
-    snapshots: in time order, none when none were wanted. Raises NotStartedError when the motion never began.
+    has_snapshots: whether they were wanted; snapshots: in time order, none where the core is compiled.
+    Raises NotStartedError when the motion never began.
     """
 
     def __init__(self, params: RigParams, with_snapshots: bool) -> None:
         rig = build_rig(params, [])
         digest = TraceHash()
+        self.has_snapshots: bool = with_snapshots
         self.snapshots: list[Snapshot] = []
+        distance_ns = snapshot_distance(params)
         for now in chunks(rig):
-            if with_snapshots and now % SNAPSHOT_NS == 0:
+            if with_snapshots and CAN_COPY and now % distance_ns == 0:
                 self.snapshots.append(_snapshot(rig, digest, self.snapshots[-1].rows if self.snapshots else 0))
         rig.gateway.finish(rig.loop.now)
         self.record: RunRecord = record_of(rig)
@@ -138,6 +148,11 @@ def _wake(gateway: Gateway, now: int, until: int, until_active: bool) -> None:
     while gateway.wake_at <= until and not (until_active and gateway.records):
         now = max(now, gateway.wake_at)
         gateway.wake(now, _NOWHERE)
+
+
+def snapshot_distance(params: RigParams) -> int:
+    """How far apart the copies of such a golden run lie [ns]."""
+    return max(1, -(-(params.stride_ns + params.duration_ns) // (MOST_SNAPSHOTS * SNAPSHOT_NS))) * SNAPSHOT_NS
 
 
 class _Nowhere(Out):

@@ -25,7 +25,7 @@ __all__ = ["Level", "LogisticFit", "curve_misfit", "fall_misfit", "logistic_fit"
 Array = NDArray[np.float64]
 
 STEPS: Final = 100
-"""Newton takes some ten; the rest is for halved steps."""
+"""Newton takes some ten, and a step some halvings."""
 SMALL: Final = 1e-8
 """Of a log-likelihood: what is nothing."""
 SIMULATED: Final = 499
@@ -177,14 +177,29 @@ def _maximum(data: _Data, offset: Array, columns: Array, start: Array) -> _Best:
         step = np.linalg.solve(curvature, gradient)
         if float(gradient @ step) < SMALL:
             return _Best(free, value)
-        for _ in range(STEPS):
-            tried = _penalised(data, offset + columns @ (free + step))
-            if tried[0] >= value:
-                break
-            step = step / 2
-        free = free + step
-        value, share, leverage = tried
+        length, there = _along(data, offset + columns @ free, columns @ step, value)
+        if there - value < SMALL * SMALL:
+            return _Best(free, value)
+        free = free + length * step
+        value, share, leverage = _penalised(data, offset + columns @ free)
     raise NotEstimableError("the fit of the curve did not settle")
+
+
+def _along(data: _Data, odds: Array, change: Array, value: float) -> tuple[float, float]:
+    """(length, value there) of a step that is doubled while that helps, or halved until it does."""
+
+    def value_at(length: float) -> float:
+        return _penalised(data, odds + length * change)[0]
+
+    length, there = 1.0, value_at(1.0)
+    for _ in range(STEPS):
+        if there >= value:
+            break
+        length /= 2
+        there = value_at(length)
+    while length >= 1 and (further := value_at(2 * length)) > there:
+        length, there = 2 * length, further
+    return length, there
 
 
 def _penalised(data: _Data, odds: Array) -> tuple[float, Array, Array]:

@@ -7,9 +7,11 @@ nobody knows what the exception left behind. Processes are started afresh (spawn
 
 import multiprocessing
 import signal
+import sys
 import time
 from collections import deque
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from multiprocessing.connection import Connection, wait
@@ -39,6 +41,19 @@ class _Task:
     started: str = ""
 
 
+@contextmanager
+def _without_interrupts() -> Iterator[None]:
+    """A process started inside never sees Ctrl-C, from its first instruction; this one gets it afterwards."""
+    if sys.platform == "win32":
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 @final
 class _Worker:
     """One process, its end of the pipe, and what it is at."""
@@ -51,7 +66,8 @@ class _Worker:
         self.is_ready: bool = False
         self.task: _Task | None = None
         self.begun: float = time.monotonic()
-        self.process.start()
+        with _without_interrupts():
+            self.process.start()
         other.close()
 
     def give(self, task: _Task) -> None:
@@ -178,6 +194,7 @@ class Pool(Executor):
         self._finished.append(replace(row, attempts=task.attempts))
 
     def _died(self, worker: _Worker) -> None:
+        worker.process.join(LEAVE_S)  # its pipes are closed, which is the last thing before the system knows its code
         code = worker.process.exitcode
         how = f"exit code {code}"
         if code is not None and code < 0:

@@ -32,8 +32,8 @@ def shown(name: str, stream: TextIO | None = None) -> Iterator[Callable[[Progres
 
 def line(far: Progress) -> str:
     """ "12 of 60 runs, 14.2 runs/min, 3 min left; 9 masked, 3 failure_silent"."""
-    rate = f"{far.per_minute:.1f} runs/min, {time_text(far.left_s)} left" if far.made else "none made yet"
-    return f"{far.done} of {far.wanted} runs, {rate}; {counts_text(far.counts)}"
+    rate = f", {far.per_minute:.1f} runs/min, {time_text(far.left_s)} left" if far.made else ""
+    return f"{far.done} of {far.wanted} runs{rate}{f'; {counts_text(far.counts)}' if far.counts else ''}"
 
 
 class _Lines:

@@ -46,6 +46,10 @@ NO_STATEMENT: Final = frozenset({Outcome.HANG, Outcome.INVALID, Outcome.CRASHED}
 """Counted apart, never among the runs of which a share is taken."""
 
 
+IN_REAL_TIME: Final = "in real time"
+"""In the code version of runs that were made against the clock: no run in virtual time stands for one of them."""
+
+
 @dataclass(frozen=True, slots=True)
 class Point:
     """A place on the grid. parameters: (axis, value as the scenario file would say it), in the order of the axes."""
@@ -110,8 +114,8 @@ class RunRow:
     its range of travel (no tolerance), and how long any joint was beyond it, 0 for not at all; beyond_joint: the worst
     one. ended_s: end of the motion that was judged, shorter than it was to be after an early stop.
     errors, failures, failures_at_3deg: number of entries. golden_hash, trace_hash: SHA-256. attempts: how often it was
-    tried; started: UTC, ISO 8601; wall_s, cpu_s: of the try that counts; forked_s: motion taken over from the golden
-    run; machine, versions: where and with what.
+    tried; started: UTC, ISO 8601; wall_s, cpu_s: of the try that counts; forked_s: simulated time taken over from the
+    golden run; machine, versions: where and with what.
     """
 
     identity: str

@@ -8,6 +8,7 @@ import platform
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from typing import Final, final
@@ -133,13 +134,14 @@ class Runner:
         number, how = self._store.invocations.begin(noted), "stopped by an error"
         next_note = begun + NOTED_S
         try:
-            while (self._queue or self._state.in_flight) and not stop():
-                self._hand_out(executor)
-                self._take(executor.collect(LOOK_S))
-                watch(self._progress(begun))
-                if time.monotonic() >= next_note:
-                    self._store.invocations.note(number, "", time.monotonic() - begun, self._made, "running")
-                    next_note = time.monotonic() + NOTED_S
+            with suppress(KeyboardInterrupt):  # a run against the clock takes Ctrl-C itself, and is dropped
+                while (self._queue or self._state.in_flight) and not stop():
+                    self._hand_out(executor)
+                    self._take(executor.collect(LOOK_S))
+                    watch(self._progress(begun))
+                    if time.monotonic() >= next_note:
+                        self._store.invocations.note(number, "", time.monotonic() - begun, self._made, "running")
+                        next_note = time.monotonic() + NOTED_S
             self._wind_up(executor, stop)
             finished = not (self._queue or self._state.in_flight)
             how = "done" if finished else "interrupted"
@@ -170,6 +172,10 @@ class Runner:
             if spec.identity in self._state.in_flight:  # two points of a search that are one scenario
                 self._queue.append(wanted)
                 return
+            made = self._stored.get(spec.identity)
+            if made is not None:
+                self._state.add(replace(made, point=wanted.point, number=wanted.number))
+                continue
             self._state.in_flight[spec.identity] = wanted
             executor.submit(spec)
 

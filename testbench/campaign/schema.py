@@ -9,7 +9,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Final, Literal, cast
+from typing import Annotated, Final, Literal
 
 from pydantic import AfterValidator, Field
 
@@ -20,14 +20,12 @@ from fi_gateway.marked_yaml import (
     FileErrors,
     Keys,
     Mark,
-    apply_override,
     did_you_mean,
     load,
     parse,
-    set_value,
 )
-from fi_gateway.quantity import describe_value
-from testbench.campaign.axes import Axis, grid, read_axis, read_settings, size
+from testbench.campaign.axes import Axis, grid, read_axis, size
+from testbench.campaign.base import base_scenario, check_injectors, check_keys
 from testbench.campaign.combinations import CombinationPlan
 from testbench.campaign.filters import Filter, parse_filter
 from testbench.campaign.identity import identity, with_seed
@@ -179,26 +177,21 @@ def campaign_in(
 
     stored: text of the scenario, and then the points are not looked at.
     """
-    if runs is not None and isinstance(document.data, dict) and "search" not in document.data:
-        document.data["runs"] = runs
+    if runs is not None and isinstance(document.data, dict):
         document.values["runs",] = document.keys["runs",] = Mark(1, 0, f"--runs {runs}")
+        document.data["runs"] = runs
     whole = validate(CampaignFile, document.data, (), document)
     data = document.data if isinstance(document.data, dict) else {}
     seed = whole.seed if whole is not None else 1
     axes = _read_axes(data.get("axes"), document, seed)
     rule = read_rule(data.get("runs"), data.get("search"), axes, document)
-    _check_open(axes, rule, document)
-    searched = rule.axis if isinstance(rule, CriticalSearch) else ""
-    spanned = [axis for axis in axes if axis.name != searched]
-    together = _read_together(whole.together if whole is not None else (), spanned, document)
     broken = _names(data.get("axes")) - {axis.name for axis in axes}
-    filters = _read_filters(data.get("filter"), spanned, broken, document)
     figures = read_figures(whole.report.figures if whole is not None and not broken else (), axes, document)
-    base, messages = _base(data, document, changes, stored)
+    base, messages = base_scenario(data, document, changes, stored)
     if isinstance(rule, CombinationSearch):
-        _check_injectors(rule, base, document)
-    _check_keys(axes, base, document)
-    points = () if document.problems else _read_points(spanned, together, filters, rule, seed, document)
+        check_injectors(rule, base, document)
+    check_keys(axes, base, document)
+    points = _read_grid(whole, data, axes, rule, document)
     _raise(document, messages)
     assert whole is not None
     assert rule is not None
@@ -226,6 +219,20 @@ def campaign_in(
         settings=settings,
         texts=texts,
     )
+
+
+def _read_grid(
+    whole: CampaignFile | None, data: dict[str, Data], axes: Sequence[Axis], rule: Rule | None, document: Document
+) -> tuple[Point, ...]:
+    """The points, when everything about them is right; what is not is reported."""
+    _check_open(axes, rule, document)
+    searched = rule.axis if isinstance(rule, CriticalSearch) else ""
+    spanned = [axis for axis in axes if axis.name != searched]
+    together = _read_together(whole.together if whole is not None else (), spanned, document)
+    broken = _names(data.get("axes")) - {axis.name for axis in axes}
+    kept = _read_filters(data.get("filter"), spanned, broken, document)
+    seed = whole.seed if whole is not None else 1
+    return () if document.problems else _read_points(spanned, together, kept, rule, seed, document)
 
 
 def _raise(document: Document, messages: Sequence[str]) -> None:
@@ -296,86 +303,6 @@ def _read_filters(data: Data, axes: Sequence[Axis], broken: set[str], document: 
         except ValueError as error:
             document.report(("filter", index) if isinstance(data, list) else ("filter",), str(error))
     return filters
-
-
-def _base(
-    data: dict[str, Data], document: Document, changes: Sequence[str], stored: str | None
-) -> tuple[Document, list[str]]:
-    """The scenario with the changes for every run, and what is wrong with it by itself."""
-    given = data.get("scenario")
-    if isinstance(given, dict):
-        base = _part(document, ("scenario",))
-    elif isinstance(given, str):
-        try:
-            path = Path(document.source).parent / given
-            base = load(path) if stored is None else parse(stored, str(path))
-        except FileErrors as error:
-            first = error.messages[0]
-            if first.endswith("no such file"):
-                document.report(("scenario",), f"{first}; it is looked for from the folder of this file")
-                return Document(document.source), []
-            return Document(document.source), list(error.messages)
-    else:
-        if "scenario" in data:
-            got = describe_value(given)
-            document.report(("scenario",), f"expected the path of a scenario, or a scenario as a mapping; got {got}")
-        return Document(document.source), []
-    settings = data.get("set")
-    if isinstance(settings, dict) and "seed" in settings:
-        document.report(("set", "seed"), "run k of every point has the campaign's seed plus k; set `seed:` itself")
-    for key, text in read_settings(settings) if isinstance(settings, dict) else ():
-        mark = document.mark(("set", key))
-        base.overrides += 1
-        set_value(base, key, text, Mark(base.overrides, 0, f"{document.source}:{mark.line}:{mark.column}: set"))
-    for change in changes:
-        apply_override(base, change)
-    try:
-        Settings(base, ()).scenario(Point(()))
-    except FileErrors as error:
-        return base, list(error.messages)
-    return base, []
-
-
-def _part(document: Document, at: Keys) -> Document:
-    """A part of a document as one of its own; places in messages stay those of the file."""
-    data, deep = document.data, len(at)
-    for key in at:
-        assert isinstance(data, dict)
-        data = data[str(key)]
-    cut = {
-        name: {keys[deep:]: mark for keys, mark in marks.items() if keys[:deep] == at}
-        for name, marks in (("values", document.values), ("keys", document.keys))
-    }
-    return Document(document.source, data, cut["values"], cut["keys"])
-
-
-def _check_keys(axes: Sequence[Axis], base: Document, document: Document) -> None:
-    """Report keys that an axis sets and the scenario has no place for, and the one that is the campaign's."""
-    for axis in axes:
-        at: Keys = ("axes", axis.name, "cases" if axis.cases else "set")
-        keys = dict.fromkeys(key for text in axis.texts for key, _ in axis.settings(text))
-        for key in keys:
-            if key == "seed":
-                document.report(at, "seed is not an axis: run k of every point has the campaign's seed plus k")
-            elif base.data is not None:
-                tried = Document(base.source, cast("Data", _deep(base.data)))
-                set_value(tried, key, "0", Mark(1, 1))
-                if tried.problems:
-                    document.report(at, f"{key}: {tried.problems[0].text} (in {base.source})")
-
-
-def _check_injectors(rule: CombinationSearch, base: Document, document: Document) -> None:
-    known = Settings(base, ()).injectors
-    for name in rule.injectors if base.data is not None else ():
-        if name not in known:
-            text = f"there is no injector {name!r}{did_you_mean(name, known)} (injectors: {', '.join(known) or 'none'})"
-            document.report(("search", "combinations", "injectors"), text)
-
-
-def _deep(data: Data) -> object:
-    if isinstance(data, dict):
-        return {key: _deep(value) for key, value in data.items()}
-    return [_deep(value) for value in data] if isinstance(data, list) else data
 
 
 def _read_points(

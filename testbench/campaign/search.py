@@ -21,7 +21,9 @@ SCANNED: Final = 5
 MAX_STEPS: Final = 1_000_000
 """Most values on the grid of a search; 2^20 of them are 20 halvings."""
 
-_QUANTITY: Final = re.compile(r"([+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]{1,2})?)\s*(\S.*)?", re.ASCII)
+_QUANTITY: Final = re.compile(
+    r"([+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]{1,2})?)\s*((?:[A-Za-zµμ%/]|1/).*)?", re.ASCII
+)
 
 
 def split_quantity(text: str) -> tuple[Decimal, str]:

@@ -39,12 +39,14 @@ def describe_campaign(campaign: Campaign) -> list[str]:
     """The campaign in sentences, for `exo-hil check`."""
     about = f": {campaign.description}" if campaign.description else ""
     lines = [f"{campaign.name}{about}"]
-    lines.append(f"scenario: {campaign.settings.base.source}")
+    base = campaign.settings.base.source
+    lines.append(f"scenario: {'in the file itself' if base == campaign.source else base}")
     lines += [f"axis {axis.name}: {_axis(axis)}" for axis in campaign.axes]
     points, rule = len(campaign.points), campaign.rule
     what = "combination" if isinstance(rule, CriticalSearch) else "point"
     lines.append(f"{points} {what}{_s(points)}; {asked(rule)}")
     lines.append(f"runs: {_runs(rule, points)}; run k of every point has seed {campaign.seed} + k")
+    lines.append("time: known when the first runs are made; `exo-hil campaign status` says then what is left")
     if campaign.stop_early is not None:
         lines.append(f"a run ends {campaign.stop_early.grace_s:g} s after its first {campaign.stop_early.on}")
     lines.append(f"result folders of single runs: {campaign.traces}; a run may take {campaign.time_limit_s:g} s")

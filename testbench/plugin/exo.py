@@ -211,9 +211,7 @@ class Exo:
             reason = self.master.failure or said or f"the controller is {controller.state.name.lower()}"
             raise AssertionError(f"the motion has not begun until {self.time_s:.3f} s: {reason}")
 
-    def expect(
-        self, cob_id: int, *, within: str, data: bytes | str | None = None, bus: str = "drive"
-    ) -> Transmission:
+    def expect(self, cob_id: int, *, within: str, data: bytes | str | None = None, bus: str = "drive") -> Transmission:
         """Let the rig run until such a frame ends on the bus, and return it; AssertionError when none comes in time.
 
         data: the whole payload; as text in hexadecimal, `..` stands for any byte: "50 82 .. .. .. .. .. ..".

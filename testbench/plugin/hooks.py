@@ -93,9 +93,7 @@ def exo_goldens() -> "Goldens":
 
 
 @pytest.fixture
-def exo(
-    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator["Exo"]:
+def exo(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator["Exo"]:
     """A rig at power-up, for this test alone: see docs/pytest.md."""
     rig: Exo | None
     try:

@@ -16,7 +16,7 @@ from typing import Final, final
 from fi_gateway.addition import Additions
 from fi_gateway.control import InjectorRow
 from fi_gateway.errors import FaultError
-from fi_gateway.injector import ACTIVE
+from fi_gateway.phase import ACTIVE
 from testbench.errors import BenchError
 from testbench.scenario import Scenario
 

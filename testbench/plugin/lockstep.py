@@ -155,5 +155,3 @@ def open_lockstep(scenario: Scenario, goldens: Goldens, without: frozenset[str])
         parts = ", ".join(sorted(without))
         raise BenchError(f"--exo-without {parts}: in lock-step no part is foreign; name a bus with --exo-bus")
     return LockStepExo(scenario, goldens)
-
-

@@ -175,9 +175,7 @@ def test_nothing_is_applied_before_something_came() -> None:
     assert not ReceivePdo(od, 0).apply(od)
 
 
-@pytest.mark.parametrize(
-    ("size", "code"), [(0, 0x8210), (1, 0x8210), (3, 0x8210), (4, 0), (5, 0x8220), (8, 0x8220)]
-)
+@pytest.mark.parametrize(("size", "code"), [(0, 0x8210), (1, 0x8210), (3, 0x8210), (4, 0), (5, 0x8220), (8, 0x8220)])
 def test_length_is_checked(size: int, code: int) -> None:
     """CiA 301, table 26: too short is 8210 and not processed, too long is 8220 and processed."""
     od = configured(0x1400)

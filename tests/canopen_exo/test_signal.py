@@ -176,9 +176,7 @@ def test_cantools_reads_what_the_codec_packs(mapping: tuple[list[tuple[int, bool
 
 
 @given(mapping=mappings(), extra=st.binary(max_size=8))
-def test_codec_ignores_further_bytes(
-    mapping: tuple[list[tuple[int, bool]], list[int]], extra: bytes
-) -> None:
+def test_codec_ignores_further_bytes(mapping: tuple[list[tuple[int, bool]], list[int]], extra: bytes) -> None:
     """CiA 301: a PDO that is too long is processed with its first bytes."""
     fields, values = mapping
     codec = compile_codec(fields)

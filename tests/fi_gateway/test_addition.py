@@ -19,7 +19,8 @@ from fi_gateway.errors import FaultError
 from fi_gateway.events import At, Event, Never
 from fi_gateway.faults import Bias, Drop, Fault
 from fi_gateway.gateway import CONTROLLER_PORT, DRIVE_PORT, Gateway
-from fi_gateway.injector import Injector, Phase, Target, stream
+from fi_gateway.injector import Injector, Target, stream
+from fi_gateway.phase import Phase
 from fi_gateway.trigger import Trigger
 
 POSITION = Signal("position", "right_knee", "right_knee_TPDO1", 0x185, 0, 32, True, 1.0, "rad", 0x6064, 0)

@@ -14,8 +14,9 @@ from fi_gateway.effects import ConstantTime, Effect, Infinite, Once
 from fi_gateway.errors import FaultError
 from fi_gateway.events import At, Event, FailureProbability, Never
 from fi_gateway.faults import Bias, Drop, Fault, StuckAt, StuckAtValue
-from fi_gateway.injector import Injector, Phase, Target, stream
+from fi_gateway.injector import Injector, Target, stream
 from fi_gateway.outlet import Tray
+from fi_gateway.phase import Phase
 from fi_gateway.trigger import Trigger
 
 WORD = Signal("statusword", "left_hip", "left_hip_TPDO2", 0x281, 0, 16, False, 1.0, "", 0x6041, 0)

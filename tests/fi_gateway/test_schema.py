@@ -608,3 +608,45 @@ def test_building_what_was_never_checked_is_refused() -> None:
     plan = BusPlan((JointNode("left_knee", 1, 54_900, 131_072),))
     with pytest.raises(FaultError, match=r"injectors\.a\.target\.node: unknown joint 'right_knee'"):
         build_injectors(specs, plan, 0, 0)
+
+
+@pytest.mark.parametrize(
+    ("fault", "effect", "warned"),
+    [
+        ("{type: bias, value: 0 deg}", "{type: once}", ["a.fault: changes nothing: value is 0"]),
+        ("{type: gain, factor: 100 %}", "{type: once}", ["a.fault: changes nothing: factor is 1"]),
+        ("{type: drift, slope: 0 deg/s}", "{type: once}", ["a.fault: changes nothing: slope is 0"]),
+        ("{type: bias, value: 0.1 deg}", "{type: once}", []),
+        (
+            "{type: bias, value: 1 deg}",
+            "{type: constant_time, duration: 100 us}",
+            [
+                "a.effect: 100 us is less than the 2 ms between two frames of the target, "
+                "so that a window may meet none"
+            ],
+        ),
+        ("{type: bias, value: 1 deg}", "{type: constant_time, duration: 2 ms}", []),
+    ],
+)
+def test_what_changes_nothing_or_may_meet_nothing_is_warned_of(fault: str, effect: str, warned: list[str]) -> None:
+    """`exo-hil check` warns of silent injectors, and of windows that fit between two frames."""
+    specs = read(a=injector(fault, event="{type: at, time: 1 s}", effect=effect))
+    assert injector_warnings(specs, PLAN, 7 * SECOND) == [f"injectors.{text}" for text in warned]
+
+
+@pytest.mark.parametrize(
+    "fault", ["{type: drop, probability: 0 %}", "{type: drop, p: 10 %, r: 10 %, loss_bad: 0 %}"]
+)
+def test_a_drop_that_loses_nothing_is_warned_of(fault: str) -> None:
+    """As above, on frames."""
+    specs = read(a=injector(fault, TPDO1, "{type: at, time: 1 s}", "{type: once}"))
+    (warning,) = injector_warnings(specs, PLAN, 7 * SECOND)
+    assert warning.startswith("injectors.a.fault: changes nothing: ")
+
+
+def test_a_short_window_that_opens_with_a_frame_is_not_warned_of() -> None:
+    """It meets that frame."""
+    short = "{type: constant_time, duration: 100 us}"
+    for event in ("{type: every, n: 3}", "{type: failure_probability, p: 1 %, per: frame}"):
+        specs = read(a=injector("{type: bias, value: 1 deg}", event=event, effect=short))
+        assert injector_warnings(specs, PLAN, 7 * SECOND) == []

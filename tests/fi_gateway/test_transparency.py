@@ -263,7 +263,7 @@ def stalled(made: Bench) -> Iterator[Stalled]:
 @pytest.fixture
 def readable_by_python(monkeypatch: pytest.MonkeyPatch) -> None:
     """A socket of our own class is not read by the kernel's recvmmsg."""
-    monkeypatch.setattr(recvmmsg, "find_recvmmsg", lambda: None)
+    monkeypatch.setattr(recvmmsg, "find_call", lambda *_: None)
 
 
 def test_frames_that_wait_for_a_busy_interface_keep_their_order(bench: MakeBench, readable_by_python: None) -> None:
@@ -276,6 +276,25 @@ def test_frames_that_wait_for_a_busy_interface_keep_their_order(bench: MakeBench
         made.pass_all([[], []], [0, len(records)])
         assert made.came[DRIVE_PORT] == records
         assert made.loop.losses() == 0
+
+
+def test_a_bus_that_takes_only_some_of_many_frames_gets_all_of_them_in_order() -> None:
+    """A local socket takes 10 messages until they are read: the kernel ends a run in its middle."""
+    records = [classical(0x200 + number, bytes((number,))) for number in range(60)]
+    pairs = iter((udp_pair, unix_pair))
+    made = Bench([injector("flip", 0x210, BitFlip(None, 1))], False, lambda: next(pairs)())
+    try:
+        for record in records:
+            made.far[CONTROLLER_PORT].send(record)
+        made.loop.poll()
+        assert made.gateway.frames == [60, 0]
+        made.pass_all([[], []], [0, 60])
+        came = made.came[DRIVE_PORT]
+        assert [record for record in came if record[0] != 0x10] == [record for record in records if record[0] != 0x10]
+        assert [record[0] for record in came] == list(range(60))
+        assert made.loop.losses() == 0
+    finally:
+        made.close()
 
 
 def test_no_command_from_before_or_during_bus_off_comes_out_after_it(
@@ -318,7 +337,7 @@ def test_an_interface_that_goes_away_and_comes_back_is_survived(
     bench: MakeBench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """ENODEV: reported, opened again with back-off; the gateway resumes without being told."""
-    monkeypatch.setattr(recvmmsg, "find_recvmmsg", lambda: None)  # what a socket of our own can play is recvmsg
+    monkeypatch.setattr(recvmmsg, "find_call", lambda *_: None)  # what a socket of our own can play is recvmsg
 
     class Gone(socket.socket):
         """A socket whose interface has been pulled out."""

@@ -15,7 +15,7 @@ from canopen_exo.master import Expected, Master, MasterState, SlaveConfig
 from canopen_exo.plan import BusPlan, JointNode
 from hlc.controller import Controller, build_controller, paper_params
 from hlc.gait import packaged_recording
-from hlc.node import Event, HighLevelController, Phase
+from hlc.node import COMMANDS_KEPT, CommandFrames, Event, HighLevelController, Phase
 
 NAMES = ("left_hip", "left_knee", "left_ankle", "right_hip", "right_knee", "right_ankle")
 RATED_MNM = (72_900, 54_900, 128_700, 72_900, 54_900, 128_700)
@@ -221,6 +221,16 @@ def status_rows(bench: Bench) -> list[tuple[int, tuple[int, int, int]]]:
 
 
 # ---- enabling -----------------------------------------------------------------------------------------------------
+
+
+def test_command_that_recurs_is_the_same_frame_and_only_so_many_are_kept() -> None:
+    """RPDO1 with controlword 0x0F and the torque, int16; what is remembered is bounded."""
+    commands = CommandFrames(0x205, PLAN.pdo("RPDO1"))
+    for torque in range(-COMMANDS_KEPT, COMMANDS_KEPT):
+        frame = commands.known.get(torque) or commands.frame(torque)
+        assert frame == Frame(0x205, struct.pack("<Hh", 0x0F, torque))
+        assert commands.known[torque] is frame
+        assert len(commands.known) <= COMMANDS_KEPT
 
 
 @pytest.mark.parametrize("joint", range(6))

@@ -15,7 +15,7 @@ from canopen_exo.eds import load_eds
 from canopen_exo.od import ObjectDictionary
 from canopen_exo.pdo import key_of
 from joint_emulators.drive import Drive
-from joint_emulators.sensors import ENCODER, VELOCITY
+from joint_emulators.sensors import ENCODER, VELOCITY, sample
 
 NODE = 3
 RATED_MNM = 72_900
@@ -623,21 +623,21 @@ def tpdo1(frames: list[Frame]) -> tuple[int, int]:
 
 def test_actual_values_change_at_sync_only(joint: Joint) -> None:
     """SYNC latches the sensors: between two SYNCs, 0x6064, 0x606C and 0x6077 show the last latched sample."""
-    joint.drive.sense(0.0, 0.0)
+    sample([joint.drive.sensor], [0.0], [0.0])
     joint.sync()
-    joint.drive.sense(0.25, 36.45)
+    sample([joint.drive.sensor], [0.25], [36.45])
     assert [joint.read(index, signed=True) for index in (0x6064, 0x606C, 0x6077)] == [0, 0, 0]
     position, velocity = tpdo1(joint.sync())
     assert position == counts(0.25)
     assert velocity > 0
-    joint.drive.sense(0.5, -36.45)
+    sample([joint.drive.sensor], [0.5], [-36.45])
     assert [joint.read(index, signed=True) for index in (0x6064, 0x606C, 0x6077)] == [position, velocity, 500]
 
 
 def test_tpdo_carries_the_sample_latched_by_its_own_sync(joint: Joint) -> None:
     """One cycle from sample to actuation needs the newest sample in the answer to this SYNC."""
     for q in (0.1, -0.2, 0.3):
-        joint.drive.sense(q, 0.0)
+        sample([joint.drive.sensor], [q], [0.0])
         assert tpdo1(joint.sync())[0] == counts(q)
 
 
@@ -645,7 +645,7 @@ def test_tpdo_carries_the_sample_latched_by_its_own_sync(joint: Joint) -> None:
 def test_position_is_the_nearest_count(q: float) -> None:
     """0x6064 in counts: half a count of 48 microradians is the largest error (1e-9 for the rounding of q itself)."""
     joint = Joint()
-    joint.drive.sense(q, 0.0)
+    sample([joint.drive.sensor], [q], [0.0])
     joint.sync()
     step = 2 * math.pi / 131_072
     assert abs(joint.read(0x6064, signed=True) * step - q) <= step / 2 + 1e-9
@@ -654,7 +654,7 @@ def test_position_is_the_nearest_count(q: float) -> None:
 @pytest.mark.parametrize(("q", "raw"), [(1e6, 2**31 - 1), (-1e6, -(2**31))])
 def test_position_does_not_wrap(joint: Joint, q: float, raw: int) -> None:
     """16384 turns fill int32; beyond, 0x6064 stays at its end."""
-    joint.drive.sense(q, 0.0)
+    sample([joint.drive.sensor], [q], [0.0])
     assert tpdo1(joint.sync())[0] == raw
 
 
@@ -662,7 +662,7 @@ def test_position_does_not_wrap(joint: Joint, q: float, raw: int) -> None:
 def test_velocity_is_in_counts_per_second(joint: Joint, speed: float) -> None:
     """0x606C: after many time constants (1.6 ms) of steady turning, true but for one count of jitter in a sample."""
     for k in range(200):
-        joint.drive.sense(speed * k * 1e-3, 0.0)
+        sample([joint.drive.sensor], [speed * k * 1e-3], [0.0])
     _, velocity = tpdo1(joint.sync())
     assert velocity == pytest.approx(speed / (2 * math.pi) * 131_072, abs=1000)  # one count in 1 ms = 1000 counts/s
 
@@ -685,14 +685,14 @@ def test_velocity_is_in_counts_per_second(joint: Joint, speed: float) -> None:
 )
 def test_torque_actual_is_per_mille_of_rated(joint: Joint, tau: float, raw: int) -> None:
     """0x6077 in per mille of 0x6076, nearest, saturated at int16."""
-    joint.drive.sense(0.0, tau)
+    sample([joint.drive.sensor], [0.0], [tau])
     joint.sync()
     assert joint.read(0x6077, signed=True) == raw
 
 
 def test_torque_actual_is_the_plants_not_the_demand(enabled: Joint) -> None:
     """0x6077 is what the joint has; 0x6074 what was asked."""
-    enabled.drive.sense(0.0, 0.0)
+    sample([enabled.drive.sensor], [0.0], [0.0])
     enabled.sync()
     assert enabled.read(0x6077, signed=True) == 0
     assert enabled.read(0x6074, signed=True) == 500
@@ -706,7 +706,7 @@ def test_tpdo2_carries_statusword_torque_and_error_code(every: int) -> None:
         assert joint.write(index, raw, size, sub=sub) == 0
     assert joint.write(0x1801, 0x280 + NODE, 4, sub=1) == 0
     joint.nmt(0x01)
-    joint.drive.sense(0.0, -7.29)
+    sample([joint.drive.sensor], [0.0], [-7.29])
     heard = []
     for _ in range(40):
         joint.rpdo(0x06, 0)

@@ -72,6 +72,25 @@ def test_torque_follows_a_step_command_with_the_exact_lag_of_the_winding() -> No
         assert plant.tau == pytest.approx(expected, rel=1e-9)
 
 
+def test_command_holds_until_it_changes_also_through_a_reset_and_a_copy() -> None:
+    """The inputs are written when the command changes: the same list with other values, after a reset, in a copy."""
+    held, written = exoskeleton(), exoskeleton()
+    command = [10.0, -20.0, 30.0, -5.0, 6.0, -7.0]
+    for n in range(12):
+        if n % 4 == 3:
+            command[n % 6] = float(n)  # in place
+        if n == 6:
+            held.reset([0.1] * 6)
+            written.reset([0.1] * 6)
+        if n == 9:
+            held = copy.deepcopy(held)
+        held.step(command)
+        written.data.ctrl[:] = 0.0
+        written._command = []  # forgets what it has written
+        written.step(command)
+        assert (held.q, held.dq, held.tau) == (written.q, written.dq, written.tau)
+
+
 def test_activation_is_the_motor_current() -> None:
     """One activation a motor: the current, torque / (K gear)."""
     plant = exoskeleton()

@@ -263,7 +263,7 @@ def test_one_sync_makes_every_operational_drive_answer_on_its_own_port(bench: Be
 def test_at_power_up_the_sensors_show_the_starting_posture(bench: Bench) -> None:
     """Before the first step the encoders have sampled the plant once."""
     for drive, q in zip(bench.rack.drives, BENT, strict=True):
-        assert drive.position_counts == math.floor(q / (2 * math.pi) * 131_072 + 0.5)
+        assert drive.sensor.counts == math.floor(q / (2 * math.pi) * 131_072 + 0.5)
 
 
 # ---- who hears what -----------------------------------------------------------------------------------------------

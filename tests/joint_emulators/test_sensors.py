@@ -17,11 +17,13 @@ from joint_emulators.sensors import (
     VELOCITY,
     EncoderParams,
     HallParams,
+    JointSensor,
     VelocityEstimateParams,
     VelocityEstimateState,
     encode,
     estimate_velocity,
     hall_state,
+    sample,
     to_int32,
 )
 
@@ -85,6 +87,20 @@ def test_impossible_encoder_is_refused(counts: int, direction: int) -> None:
 def run_estimate(counts: list[int], params: VelocityEstimateParams = VELOCITY) -> list[int]:
     state = VelocityEstimateState()
     return [to_int32(estimate_velocity(params, state, value)) for value in counts]
+
+
+@given(st.lists(st.floats(-2e5, 2e5), max_size=30), st.integers(-1000, 1000), st.sampled_from([1, -1]))
+def test_sensor_of_a_joint_is_encoder_and_speed_estimate_in_one(
+    angles: list[float], offset: int, direction: int
+) -> None:
+    """`sample`: to the last bit what `encode` and `estimate_velocity` give, beyond int32 too."""
+    params = EncoderParams(131072, offset, direction)
+    sensor, state = JointSensor(params, VELOCITY), VelocityEstimateState()
+    for at, q in enumerate(angles):
+        sample([sensor], [q], [float(at)])
+        counts = encode(q, params)
+        speed = estimate_velocity(VELOCITY, state, counts)
+        assert (sensor.counts, sensor.speed, sensor.torque_nm) == (counts, speed, at)
 
 
 def test_first_sample_has_no_speed_wherever_the_joint_stands() -> None:

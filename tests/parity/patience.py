@@ -34,6 +34,15 @@ _LATE: Final = (
 )
 """In the reasons of an invalid run: what a machine that is too busy does to it."""
 
+_RIG_LATE: Final = "the rig was late: "
+"""How `exo-hil up` says so, see Watch.timing_words."""
+
+_TIMED_OUT: Final = ("not ready after ", "no boot-up message within ", "no SDO answer within ")
+"""A rig that did not come as far as its first cycle. Whether it can is seen by the tests that were not late."""
+
+_LATE_SHARE: Final = 0.01
+"""Of all cycles; fewer make no run invalid either."""
+
 _LATEST: Final = re.compile(r"the latest ([\d.]+) ms")
 _COUNTED: Final = re.compile(r": (\d+) frames (?:dropped|not taken|of both buses not heard)")
 _LOST: Final = re.compile(r"\((\d+)\)")
@@ -98,16 +107,22 @@ def is_lateness(reasons: list[str], cycle_ms: float) -> bool:
     return bool(late) and not rest and sum(int(one) for reason in lost for one in _LOST.findall(reason)) <= counted
 
 
+def gave_up_late(said: str) -> bool:
+    """Whether a rig that ended by itself says that it was late, or that something was not there in time."""
+    return _RIG_LATE in said or any(words in said for words in _TIMED_OUT)
+
+
 def told_late(output: str, cycle_ms: float) -> list[str]:
     """What a pytest run with the plug-in printed that shows a rig too late for its test; empty for one that kept time.
 
-    Its `timing:` lines say so when a cycle was late, a SYNC off by half a cycle, a frame not heard, or none complete.
+    Its `timing:` lines say so: more than 1 % of the cycles late, a SYNC off by more than half a cycle, a frame not
+    heard. A rig without a single complete cycle was late only if it did not get ready in time.
     """
-    found = [line for line in output.splitlines() if "not ready after" in line]
+    found = [line for line in output.splitlines() if any(words in line for words in _TIMED_OUT)]
     for line in output.splitlines():
         told = _TIMING.match(line)
         if told is not None:
             late, cycles, off_ms, missed = (float(one) for one in told.groups())
-            if late or not cycles or off_ms > cycle_ms / 2 or missed:
+            if late > _LATE_SHARE * cycles or off_ms > cycle_ms / 2 or missed:
                 found.append(line)
     return found

@@ -14,9 +14,10 @@ from canopen_exo import plan as ids
 from canopen_exo.bus.node import MS, NEVER, SECOND
 from testbench.child import ProcessError
 from testbench.parts import HlcPart, JointsPart, read_gateway, read_hlc, read_joints
+from testbench.process import ENDED_EARLY
 from testbench.scenario import JOINT_NAMES
 from testbench.supervisor import REACT_NS, Setup, Supervisor
-from tests.parity.patience import Late, Patience, distributions
+from tests.parity.patience import Late, Patience, distributions, gave_up_late
 from tests.parity.walks import Bench
 
 LONG_NS: Final = 20 * SECOND
@@ -64,12 +65,14 @@ def walk(rig: Supervisor, for_ns: int = 300 * MS) -> Late | None:
     try:
         rig.run(lambda now: now > min(rig.watch.time_zero + for_ns, limit) or hlc.code is not None)
     except ProcessError as error:
-        if hlc.code != 1:
+        if hlc.code != ENDED_EARLY or not gave_up_late(str(error)):
             raise
         return Late(str(error))  # it gave up and says why: drives that miss SYNC for five cycles stop
     if hlc.code is None and rig.watch.time_zero != NEVER:
         return None
-    return Late(f"the motion did not go on: {hlc.obituary()}")
+    why = f"the motion did not go on: {hlc.obituary()}; {rig.watch.timing_words()}"
+    assert gave_up_late(why), why
+    return Late(why)
 
 
 def heard(rig: Supervisor, condition: Callable[[], bool]) -> Late | None:
@@ -79,7 +82,10 @@ def heard(rig: Supervisor, condition: Callable[[], bool]) -> Late | None:
     if condition():
         return None
     assert _stopped(rig), f"not heard in {LONG_NS / SECOND:g} s; drives: {rig.watch.states}"
-    return Late(f"drives missed SYNC or commands: {sorted({f'{one.code:04X}' for one in rig.watch.alarms})}")
+    codes = sorted({f"{one.code:04X}" for one in rig.watch.alarms})
+    words = rig.watch.timing_words()
+    assert words or not rig.watch.cycles, f"drives missed SYNC or commands ({codes}) in a rig that kept time"
+    return Late(f"drives missed SYNC or commands: {codes}; {words}")
 
 
 def _stopped(rig: Supervisor) -> bool:

@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.parity.patience import TRIES, Late, Patience, is_lateness, told_late
+from tests.parity.patience import TRIES, Late, Patience, gave_up_late, is_lateness, told_late
 
 
 class Machine:
@@ -69,7 +69,9 @@ def test_punctual_runs_use_no_patience_up() -> None:
     [
         ("timing: 0 of 90 cycles late, SYNC off by at most 0.4 ms; 0 frames not heard", False),
         ("timing: 1 of 90 cycles late, SYNC off by at most 0.4 ms; 0 frames not heard", True),
-        ("timing: 0 of 0 cycles late, SYNC off by at most 0.0 ms; 0 frames not heard", True),
+        ("timing: 1 of 100 cycles late, SYNC off by at most 0.4 ms; 0 frames not heard", False),
+        ("timing: 0 of 0 cycles late, SYNC off by at most 0.0 ms; 0 frames not heard", False),
+        ("E   left_hip (node 1): no boot-up message within 1 s of reset communication; check power", True),
         ("timing: 0 of 90 cycles late, SYNC off by at most 5.1 ms; 0 frames not heard", True),
         ("timing: 0 of 90 cycles late, SYNC off by at most 5.0 ms; 2 frames not heard", True),
         ("E   ProcessError: joints: not ready after 30 s: no boot-up", True),
@@ -79,6 +81,22 @@ def test_punctual_runs_use_no_patience_up() -> None:
 def test_failure_of_a_users_test_is_a_matter_of_lateness_only_when_it_says_so(line: str, is_late: bool) -> None:
     """A failure in a rig that kept time (10 ms cycle) is a failure."""
     assert told_late(f"before\n{line}\nafter\n", 10.0) == ([line] if is_late else [])
+
+
+@pytest.mark.parametrize(
+    ("said", "is_late"),
+    [
+        ("hlc ended with exit code 4\nthe rig was late: 3 of 50 cycles, SYNC off by at most 30.1 ms; this", True),
+        ("joints: not ready after 30 s: no boot-up and no SDO answer on the drive bus", True),
+        ("hlc: left_hip: no SDO answer within 0.5 s while writing 0x0 to 1400:01; check the device and the bus", True),
+        ("hlc ended with exit code 4\nthe motion ended because left_hip dropped its torque: SYNC lost (8700)", False),
+        ("gateway ended with exit code 1\nTraceback (most recent call last):", False),
+        ("", False),
+    ],
+)
+def test_rig_that_gave_up_was_late_only_when_it_says_so(said: str, is_late: bool) -> None:
+    """Whatever else ends a rig is a defect."""
+    assert gave_up_late(said) == is_late
 
 
 BUSY = "golden run: 10 of 200 cycles late (5.0 %), allowed 1 %: cycle 8, joints sent 181"

@@ -13,6 +13,7 @@ import pytest
 from canopen_exo.bus.node import SECOND
 from fi_gateway.schema import build_injectors
 from hlc.limits import limits_of
+from testbench.child import ProcessError
 from testbench.merge import IncompleteError
 from testbench.realtime_run import RealTimeRun, limits_in, run_once
 from testbench.record import RunRecord
@@ -94,8 +95,8 @@ def attempt_run(setup: Setup) -> RealTimeRun | Late:
     cycle_ms = setup.scenario.plan.cycle_ns / 1e6
     try:
         run = run_once(setup)
-    except IncompleteError as error:  # drives that miss SYNC for five cycles stop by themselves
-        if not is_lateness([str(error)], cycle_ms):
+    except (IncompleteError, ProcessError) as error:  # drives that miss SYNC for five cycles stop by themselves
+        if not is_lateness([str(error)], cycle_ms) and "not ready after " not in str(error):
             raise
         return Late(str(error))
     assert run.timing.found <= run.timing.counted, run.timing.lost

@@ -19,6 +19,7 @@ from testbench.parts import (
     JointsPart,
     NotedEvent,
     PartError,
+    Reach,
     Service,
     read_gateway,
     read_hlc,
@@ -103,7 +104,8 @@ def test_gateway_part_comes_back_as_written(tmp_path: Path) -> None:
     activation.stream = "12.3.0.0"
     controls = [ControlNote(11, "trigger", "freeze", "socket", ""), ControlNote(12, "arm", "x", "bus", "no such")]
     latency = [Lateness(), service().lateness]
-    write_gateway(path, GatewayPart(service(), 99, 2, [5, 6], [0, 1], latency, [activation], controls, ROWS))
+    reaches = {"freeze": Reach(True, False, (0x185,)), "x": Reach(False, True, (0x201, 0x202), (0x6F0,))}
+    write_gateway(path, GatewayPart(service(), 99, reaches, [5, 6], [0, 1], latency, [activation], controls, ROWS))
     found = read_gateway(path)
     (one,) = found.activations
     for name in ("injector", "index", "signal", "cause", "due_ns", "start_ns", "duration_ns", "end_ns", "frames_seen"):
@@ -111,7 +113,7 @@ def test_gateway_part_comes_back_as_written(tmp_path: Path) -> None:
     assert (one.frames_unfit, one.frames_changed, one.saturated) == (1, 7, 2)
     assert (one.first_before, one.first_after, one.stream) == (Frame(0x185, bytes(8)), None, "12.3.0.0")
     assert found.controls == controls
-    assert (found.time_zero, found.injectors, found.frames, found.lost) == (99, 2, [5, 6], [0, 1])
+    assert (found.time_zero, found.injectors, found.frames, found.lost) == (99, reaches, [5, 6], [0, 1])
     assert [one.document() for one in found.latency] == [one.document() for one in latency]
 
 

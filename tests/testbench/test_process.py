@@ -23,7 +23,7 @@ from canopen_exo.bus.frame import Frame
 from canopen_exo.bus.interfaces import BusName, parse_bus
 from canopen_exo.bus.node import MS, NEVER, SECOND, ErrorState, Node, PortState
 from fi_gateway.control import NAMED, WORDS
-from fi_gateway.control_socket import DEFAULT_ADDRESS
+from fi_gateway.control_address import DEFAULT_ADDRESS
 from fi_gateway.gateway import CONTROLLER_PORT, DRIVE_PORT
 from testbench import cli_rig, gateway_process, process, supervisor
 from testbench.cli import main

@@ -26,7 +26,7 @@ from testbench.errors import BenchError
 from testbench.process import DONE, ENDED_EARLY, LEAVE_NS
 from testbench.scenario import JOINT_NAMES, Scenario
 from testbench.supervisor import Setup, Supervisor
-from tests.parity.patience import Late, Patience
+from tests.parity.patience import Late, Patience, gave_up_late
 from tests.parity.rigs import LONG_NS, check_killed, heard, nothing_left, walk
 from tests.parity.walks import Bench
 
@@ -135,6 +135,7 @@ def attempt_up(folder: Path, number: signal.Signals) -> int | Late:
         assert up.stderr is not None
         up.stderr.close()
     if code == INVALID:  # drives that missed SYNC for five cycles have stopped by themselves before they were told
+        assert gave_up_late("".join(said)), said
         return Late("".join(said)[-300:])
     assert len(children) == 4, said
     assert any(re.match(r"controller bus: hub:127\.0\.0\.1:\d+/controller", line) for line in said)

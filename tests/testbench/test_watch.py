@@ -1,6 +1,7 @@
 """The listener on both buses, connected to a rig in lock-step; and the status line made of it."""
 
 import io
+import os
 
 import pytest
 
@@ -206,9 +207,24 @@ def test_status_line_has_load_lateness_drive_states_and_active_faults() -> None:
     assert watch.time_zero == 390 * MS
     share = 100 * watch.bits[0] / 500_000
     assert text == (
-        f"walking 0.1 s | load {share:.0f} %, 0 % | late 0 of 48 cycles, SYNC off by at most 0.0 ms | "
-        "drives: 1 operation enabled, 5 no status | drive bus bus off | faults: freeze_position"
+        "walking 0.1 s | faults: freeze_position | drive bus bus off | drives: 1 operation enabled, 5 no status | "
+        f"load {share:.0f} %, 0 % | late 0 of 48 cycles, SYNC off by at most 0.0 ms"
     )
+
+
+@pytest.mark.parametrize("columns", [0, 1, 2, 20, 80, 500])
+def test_status_line_never_wraps(columns: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What wraps could not be rewritten in place. A terminal that does not tell its width (0) gets all of it."""
+    terminal = Terminal()
+    monkeypatch.setattr(terminal, "fileno", lambda: 2)
+    monkeypatch.setattr(os, "get_terminal_size", lambda fd: os.terminal_size((columns, 25)))
+    line = StatusLine(Watch(PLAN), terminal, lambda: ["freeze_position"])
+    whole = line.text(0)
+    line.show(0)
+    shown = terminal.getvalue().removeprefix("\r\x1b[K")
+    assert len(shown) < columns or shown == whole
+    assert (shown == whole) == (columns in (0, 500))
+    assert whole.startswith(shown)
 
 
 def test_status_line_is_rewritten_in_place_and_only_on_a_terminal() -> None:

@@ -10,7 +10,7 @@ from canopen_exo.bus.node import MS, NEVER, SECOND, ErrorState
 from canopen_exo.bus.trace import trace_hash
 from canopen_exo.bus.wire import Wire
 from canopen_exo.plan import BusPlan
-from fi_gateway.wire_faults import BitError, BitErrorRate, BusOff, mask_of
+from fi_gateway.wire_faults import BitError, BitErrorRate, mask_of
 from hlc.node import Phase
 from testbench.rig import CONTROLLER_BUS, DRIVE_BUS, Rig, RigParams, build_rig
 from testbench.run import drive_through
@@ -80,7 +80,7 @@ def test_drive_that_goes_bus_off_drops_its_torque_at_once_and_tells_8140_when_it
     port.restart_ns = 50 * MS
     now = rig.loop.now
     assert rig.rack.drives[KNEE].torque_nm != 0
-    BusOff(wire, port).begin(now)
+    wire.switch_off(now, port)
     assert rig.rack.drives[KNEE].torque_nm == 0
     assert all(drive.torque_nm != 0 for drive in rig.rack.drives if drive is not rig.rack.drives[KNEE])
     rig.loop.run_until(now + 60 * MS)
@@ -100,7 +100,7 @@ def test_drive_that_stays_bus_off_hears_nothing_and_is_lost_by_its_heartbeat() -
     port.restart_ns = NEVER
     now = rig.loop.now
     rows = len(rig.loop.trace)
-    BusOff(wire, port).begin(now)
+    wire.switch_off(now, port)
     rig.loop.run_until(now + 300 * MS)
     assert rig.rack.devices[KNEE].emcy.active.keys() >= {0x8700}
     assert not any(0x8700 in device.emcy.active for device in rig.rack.devices if device.port != KNEE)
@@ -114,7 +114,7 @@ def test_drive_that_stays_bus_off_hears_nothing_and_is_lost_by_its_heartbeat() -
 def test_drive_whose_frames_always_fail_becomes_passive_then_bus_off() -> None:
     """EMCY 8120 gets through, since its id is lower, and brings the TEC back by 1; then bus-off, and 8140."""
     rig = rig_of()
-    fault = BitError("crc", 2, cob_ids=(0x182,), attempts=100)
+    fault = BitError("crc", 2, cob_ids=(0x182,))
     assert fault.field in FIELDS
     wired(rig, DRIVE_BUS, fault)
     walking(rig)
@@ -127,6 +127,7 @@ def test_drive_whose_frames_always_fail_becomes_passive_then_bus_off() -> None:
             states.append(port.state)
     assert states[:3] == [ErrorState.ERROR_ACTIVE, ErrorState.WARNING, ErrorState.ERROR_PASSIVE]
     assert states[-1] is ErrorState.BUS_OFF
+    fault.end(rig.loop.now)
     codes = [event.text for event in rig.controller.events if event.joint == "left_knee"]
     assert any("8120" in text for text in codes)
     rig.loop.run_until(rig.loop.now + 200 * MS)
@@ -136,7 +137,7 @@ def test_drive_whose_frames_always_fail_becomes_passive_then_bus_off() -> None:
 def test_error_at_one_passive_drive_keeps_the_frame_from_it_alone() -> None:
     """Its flag is recessive: the others have the frame, it does not."""
     rig = rig_of()
-    fault = BitError("crc", 2, mask_of([KNEE_PORT]), (0x080,), attempts=0)
+    fault = BitError("crc", 2, mask_of([KNEE_PORT]), (0x080,))
     wire = wired(rig, DRIVE_BUS, fault)
     walking(rig)
     port = rig.drive_bus.ports[KNEE_PORT]

@@ -94,7 +94,8 @@ def test_a_missing_acknowledgement_that_another_node_gives_disturbs_nothing() ->
     one, everybody = found(result, "one"), found(result, "all")
     assert one["attempts_seen"] == 60  # 20 ms of six drives at 500 Hz
     assert one["attempts_disturbed"] == 0
-    assert everybody["attempts_disturbed"] == everybody["attempts_seen"] > 0
+    assert everybody["attempts_disturbed"] > 10
+    assert everybody["attempts_seen"] - everybody["attempts_disturbed"] <= 1  # the last one's ACK slot comes after
 
 
 def test_a_wire_fault_triggers_a_payload_fault_and_is_triggered_by_one() -> None:

@@ -91,3 +91,20 @@ def test_clocks_are_compared_again_only_after_an_interruption(
         if interrupted < 5:
             assert abs(stamps.at(clocks.wall) - (clocks.monotonic - EPOCH)) <= cost_ns
     assert counts == [first, 1, 3, 1, 5]
+
+
+@pytest.mark.parametrize(
+    ("first", "later"),
+    [(WALL - 5 * MS, (MS, MS, 2 * MS)), (WALL - 5 * MS, (3 * MS, -MS, MS)), (WALL - 2 * MS, (MS, 9 * MS, -20 * MS))],
+)
+def test_many_stamps_are_what_they_are_one_by_one(clocks: FakeTime, first: int, later: tuple[int, ...]) -> None:
+    """Also where they go back, lie in the future, or the second changes among them."""
+    times = [first - SECOND // 2, first]
+    for step in later:
+        times.append(times[-1] + step)
+    one, many = StampClock(), StampClock()
+    one.begin(EPOCH)
+    many.begin(EPOCH)
+    parts = [divmod(time_ns, SECOND) for time_ns in times]
+    assert many.many([part[0] for part in parts], [part[1] for part in parts]) == [one.at(time_ns) for time_ns in times]
+    assert many.many([parts[0][0]], [parts[0][1]]) == [one.at(times[0])]

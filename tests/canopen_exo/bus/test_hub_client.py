@@ -267,6 +267,28 @@ def test_stamps_of_a_hub_on_another_machine_are_moved_to_our_clock(fake_hub: Fak
     channel.close()
 
 
+def test_flood_is_read_in_batches(fake_hub: FakeHub, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The loop must come to its wake-ups, however fast others send; nothing of it is lost."""
+    channel = HubChannel(f"{fake_hub.address}/drive")
+    flood = pack_frame(Frame(1, b"12345678")) * 10_000
+    taken = 0
+
+    def read() -> bytes:
+        nonlocal taken
+        rest, channel._link.rest = channel._link.rest, b""
+        more = flood[taken % 24 :][: 1 << 16]
+        taken += len(more)
+        assert taken < 100 << 16, "it never stops to read"
+        return rest + more
+
+    with fake_hub.welcome(channel, time.monotonic_ns()):
+        monkeypatch.setattr(channel._link, "read", read)
+        found = [len(channel.receive()) for _ in range(5)]
+    assert sum(found) == taken // 24
+    assert max(found) <= 4 * (1 << 16) // 24 + 1
+    channel.close()
+
+
 def test_frame_is_not_stamped_earlier_than_it_came(fake_hub: FakeHub, monkeypatch: pytest.MonkeyPatch) -> None:
     """A process held up on its way to the socket reads what came meanwhile: with the hub's stamp, not an older now."""
     channel = HubChannel(f"{fake_hub.address}/drive")

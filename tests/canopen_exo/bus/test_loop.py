@@ -4,10 +4,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from canopen_exo.bus.frame import Frame
+from canopen_exo.bus.frame import FLAG_EXTENDED, Frame
 from canopen_exo.bus.loop import Loop
 from canopen_exo.bus.medium import Medium
-from canopen_exo.bus.node import NEVER, Node, Out
+from canopen_exo.bus.node import IGNORE, NEVER, PASS_ON, TAKE, Node, Out, Relay, open_filter
 from canopen_exo.bus.trace import trace_hash
 from canopen_exo.errors import CanopenExoError
 
@@ -296,6 +296,93 @@ def test_node_on_two_buses_is_told_the_port() -> None:
     assert heard == [("gateway", 1, "001"), ("gateway", 0, "002")]
 
 
+@pytest.mark.parametrize(
+    ("frame", "hears"), [(Frame(5, b""), 0), (Frame(6, b""), 1), (Frame(5, b"", FLAG_EXTENDED), 1)]
+)
+def test_node_is_not_called_for_what_its_filter_ignores(frame: Frame, hears: int) -> None:
+    """Node.filters: IGNORE is said of base data frames only."""
+    log: list[Call] = []
+    loop = Loop(media())
+    listener = Script("listener", log)
+    listener.filters = [open_filter()]
+    listener.filters[0][5] = IGNORE
+    loop.connect(listener, loop.media)
+    loop.connect(Script("talker", [], (0, 0, frame)), loop.media)
+    loop.run_until(1_000_000)
+    assert (len(log), len(loop.trace)) == (hears, 1)
+
+
+def test_filter_that_a_node_changes_acts_on_the_next_frame() -> None:
+    """What stands in a filter may change at any time."""
+    log: list[Call] = []
+    loop = Loop(media())
+
+    class Fickle(Script):
+        def receive(self, now: int, port: int, frame: Frame, out: Out) -> None:
+            super().receive(now, port, frame, out)
+            self.filters[0][5] = IGNORE
+
+    listener = Fickle("listener", log)
+    listener.filters = [open_filter()]
+    loop.connect(listener, loop.media)
+    loop.connect(Script("talker", [], *((at, 0, Frame(5, b"")) for at in range(3))), loop.media)
+    loop.run_until(1_000_000)
+    assert (len(log), len(loop.trace)) == (1, 3)
+
+
+class Repeater(Relay):
+    """Passes everything on; `passes`: leaves that to the loop for ids below 0x400."""
+
+    def __init__(self, passes: bool) -> None:
+        super().__init__()
+        self.calls = 0
+        for table in self.filters:
+            for can_id in range(0x400):
+                table[can_id] = PASS_ON if passes else TAKE
+
+    def receive(self, now: int, port: int, frame: Frame, out: Out) -> None:
+        self.calls += 1
+        self.frames[port] += 1
+        out.send(1 - port, frame)
+
+
+CROSSING = st.lists(
+    st.tuples(
+        st.integers(0, 2_000) | st.integers(0, 20).map(lambda at: at * 100),
+        st.integers(0, 3),
+        st.integers(0, 0x7FF),
+        st.binary(max_size=8),
+        st.sampled_from([0, 0, 0, FLAG_EXTENDED]),
+    ),
+    max_size=60,
+)
+
+
+@given(sends=CROSSING)
+def test_loop_passes_on_for_a_relay_as_the_relay_itself_would(sends: list[tuple[int, int, int, bytes, int]]) -> None:
+    """Relay: the same trace, calls of others and counts, whoever passes a frame on, also at one instant on both."""
+
+    def run(passes: bool) -> tuple[str, list[Call], list[int], int]:
+        log: list[Call] = []
+        loop = Loop(media(2))
+        repeater = Repeater(passes)
+        ends = [Script(str(node), log, *(
+            (at * BIT, 0, Frame(can_id, data, flags)) for at, sender, can_id, data, flags in sends if sender == node
+        )) for node in range(4)]
+        loop.connect(ends[0], [loop.media[0]])
+        loop.connect(repeater, loop.media)
+        for node in (1, 2, 3):
+            loop.connect(ends[node], [loop.media[node % 2]])
+        loop.run_until(50_000_000)
+        return trace_hash(loop.trace), log, repeater.frames, repeater.calls
+
+    alone, helped = run(False), run(True)
+    assert alone[:3] == helped[:3]
+    assert alone[3] == len(sends)
+    if len(sends) == 1:  # nothing ends at the same time
+        assert helped[3] == (0 if sends[0][2] < 0x400 and not sends[0][4] else 1)
+
+
 # --- running -----------------------------------------------------------------------------------------------------
 
 
@@ -323,9 +410,7 @@ def test_run_until_is_inclusive_for_frames(until: int, served: int) -> None:
 
 
 @given(sends=SENDS, stops=st.lists(st.integers(0, 3_000_000), max_size=10))
-def test_stopping_in_between_changes_nothing(
-    sends: list[tuple[int, int, int, bytes]], stops: list[int]
-) -> None:
+def test_stopping_in_between_changes_nothing(sends: list[tuple[int, int, int, bytes]], stops: list[int]) -> None:
     """Many calls of `run_until` give the trace of one."""
 
     def run(times: list[int]) -> str:

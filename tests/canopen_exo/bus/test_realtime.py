@@ -98,7 +98,14 @@ class World:
         readable += [fd for fd in self.ready if fd in readers]
         return readable, [channel.fd for channel in self.channels if channel.takes and channel.fd in writers]
 
-    def loop(self, node: Node, ports: list[int], record: bool = False, measure_latency: bool = False) -> RealTimeLoop:
+    def loop(
+        self,
+        node: Node,
+        ports: list[int],
+        record: bool = False,
+        measure_latency: bool = False,
+        busy_poll: bool = False,
+    ) -> RealTimeLoop:
         channels: list[Channel] = list(self.channels)
         return RealTimeLoop(
             node,
@@ -107,6 +114,7 @@ class World:
             EPOCH,
             record=record,
             measure_latency=measure_latency,
+            busy_poll=busy_poll,
             clock=self.clock,
             wait=self.wait,
         )
@@ -240,9 +248,7 @@ def test_stamp_in_the_future_does_not_wake_the_node_early() -> None:
     st.integers(1, 900),
     st.integers(0, 3000),
 )
-def test_any_traffic_is_served_once_in_order(
-    plan: list[tuple[int, int, int]], period: int, oversleep: int
-) -> None:
+def test_any_traffic_is_served_once_in_order(plan: list[tuple[int, int, int]], period: int, oversleep: int) -> None:
     """Nothing lost, time never back for frames, wake-ups each at their time, each channel's order kept."""
     world = World(2)
     world.oversleep = oversleep
@@ -607,3 +613,43 @@ def test_garbage_collection_is_as_before_after_a_run() -> None:
     with pytest.raises(CanopenExoError):
         World().loop(Diary(0), [0]).run(lambda now: False)
     assert gc.isenabled()
+
+
+def test_busy_poll_sleeps_only_when_nothing_has_come_for_10_ms() -> None:
+    """docs/real_time.md: with `--busy-poll` a core is taken while frames come, and given back soon after the last."""
+    world = World()
+    world.oversleep = MS  # else no time would pass
+    world.arrive(5 * MS, 0, Frame(0x181, b""))
+    node = Diary()
+    at: list[int] = []
+
+    def over(now: int) -> bool:
+        at.append(now)
+        return now > 40 * MS
+
+    world.loop(node, [0], busy_poll=True).run(over)
+    assert [row[0] for row in node.rows] == ["frame"]
+    seen = node.rows[0][1] + world.oversleep
+    awake = [now for now, timeout_s in zip(at, world.waits, strict=False) if timeout_s == 0.0]
+    assert awake == [now for now in at if seen <= now < seen + 10 * MS]
+    assert len(awake) == 10
+
+
+def test_readers_that_come_and_go_are_waited_for() -> None:
+    """Live control: a reader added while the loop runs is served, one removed is not."""
+    world = World()
+    heard: list[int] = []
+
+    class File:
+        def fileno(self) -> int:
+            return 77
+
+    def remove(now: int) -> None:
+        heard.append(now)
+        loop.remove_reader(File())
+
+    loop = world.loop(Diary(), [0])
+    world.at(2 * MS, lambda: loop.add_reader(File(), remove))
+    world.at(2 * MS, lambda: world.ready.append(77))
+    loop.run(lambda now: now > 200 * MS)
+    assert len(heard) == 1

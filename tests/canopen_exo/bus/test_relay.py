@@ -1,16 +1,16 @@
 """A Relay served by records: what goes out, and what the node sees of it, is as if every frame had been handled."""
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from canopen_exo.bus.channel import Arrival, RecordArrival, RecordChannel
+from canopen_exo.bus.channel import Arrival, RecordChannel
 from canopen_exo.bus.frame import FLAG_EXTENDED, Frame
 from canopen_exo.bus.node import NEVER, PASS_ON, TAKE, ErrorState, Out, PortState, Relay
 from canopen_exo.bus.realtime import RealTimeLoop
-from canopen_exo.bus.socketcan import decode, encode
 
-LOOKED_AT, DISTURBING, CALMING = 1, 2, 3
-"""Ids the node wants to see; after the last but one it wants to see all, up to the last one."""
+LOOKED_AT, CALMING = 1, 2
+"""Ids the node wants to see. It sees all while a port is bus-off, up to the next frame with the last one."""
 
 
 class FakeRecordChannel(RecordChannel):
@@ -23,6 +23,7 @@ class FakeRecordChannel(RecordChannel):
         self.inbox: list[tuple[int, Frame | PortState]] = []
         self.sent: list[Frame] = []
         self.records = 0
+        self.found: list[Arrival] = []
 
     def fileno(self) -> int:
         return self.fd
@@ -35,20 +36,16 @@ class FakeRecordChannel(RecordChannel):
         self.inbox = []
         return found
 
-    def receive_records(self, place: int) -> list[RecordArrival]:
-        found: list[RecordArrival] = []
-        for arrival in self.receive():
-            frame = arrival.frame
-            if frame is None or frame.flags:
-                found.append((arrival.stamp_ns, place, -1, b"", arrival))
-            else:
-                found.append((arrival.stamp_ns, place, frame.can_id, encode(frame), None))
-        return found
+    def read(self) -> bool:
+        self.found = self.receive()
+        self.count = len(self.found)
+        frames = [arrival.frame for arrival in self.found]
+        self.ids = [frame.can_id for frame in frames if frame is not None and not frame.flags]
+        self.stamps = [arrival.stamp_ns for arrival in self.found]
+        return len(self.ids) == self.count
 
-    def frame_in(self, record: bytes) -> Frame:
-        frame = decode(record)
-        assert frame is not None
-        return frame
+    def arrival(self, number: int) -> Arrival:
+        return self.found[number]
 
     def send(self, frame: Frame) -> bool:
         if self.takes == 0:
@@ -57,8 +54,13 @@ class FakeRecordChannel(RecordChannel):
         self.sent.append(frame)
         return True
 
-    def send_record(self, record: bytes) -> bool:
-        taken = self.send(self.frame_in(record))
+    def send_run(self, source: RecordChannel, start: int, end: int) -> int:
+        assert isinstance(source, FakeRecordChannel)
+        taken = 0
+        for arrival in source.found[start:end]:
+            if arrival.frame is None or not self.send(arrival.frame):
+                break
+            taken += 1
         self.records += taken
         return taken
 
@@ -67,11 +69,11 @@ class FakeRecordChannel(RecordChannel):
 
 
 class Diarist(Relay):
-    """Passes frames on, writes down what it has to look at, and is woken every 10 ns."""
+    """Passes frames on, writes down what it has to look at, and is woken at `wake_at` and every 10 ns from then."""
 
-    def __init__(self) -> None:
+    def __init__(self, wake_at: int) -> None:
         super().__init__()
-        self.wake_at = 10
+        self.wake_at = wake_at
         self.seen: list[tuple[int, int]] = []
         self.sees_all = False
         self.filter()
@@ -79,15 +81,15 @@ class Diarist(Relay):
     def filter(self) -> None:
         for port in (0, 1):
             for can_id in range(0x10):
-                is_looked_at = self.sees_all or can_id in (LOOKED_AT, DISTURBING, CALMING)
+                is_looked_at = self.sees_all or can_id in (LOOKED_AT, CALMING)
                 self.filters[port][can_id] = TAKE if is_looked_at else PASS_ON
 
     def receive(self, now: int, port: int, frame: Frame, out: Out) -> None:
         self.frames[port] += 1
-        if self.sees_all or frame.can_id in (LOOKED_AT, DISTURBING, CALMING) or frame.flags:
+        if self.sees_all or frame.can_id in (LOOKED_AT, CALMING) or frame.flags:
             self.seen.append((now, frame.can_id))
-        if frame.can_id in (DISTURBING, CALMING):
-            self.sees_all = frame.can_id == DISTURBING
+        if frame.can_id == CALMING:
+            self.sees_all = False
             self.filter()
         out.send(1 - port, frame)
 
@@ -97,12 +99,18 @@ class Diarist(Relay):
 
     def port_changed(self, now: int, state: PortState, out: Out) -> None:
         self.seen.append((now, -2 - state.port))
+        self.sees_all = state.state is ErrorState.BUS_OFF
+        self.filter()
 
 
 things = st.one_of(
     st.builds(Frame, st.integers(0, 12), st.binary(max_size=8)),
     st.builds(Frame, st.integers(0, 12), st.binary(max_size=8), st.just(FLAG_EXTENDED)),
-    st.just(PortState(0, ErrorState.WARNING, 96, 0, "")),
+    st.sampled_from([PortState(0, state, 96, 0, "") for state in (ErrorState.WARNING, ErrorState.BUS_OFF)]),
+)
+plain_traffic = st.lists(
+    st.tuples(st.integers(0, 1), st.integers(0, 9), st.builds(Frame, st.integers(0, 12), st.binary(max_size=8))),
+    max_size=40,
 )
 traffic = st.lists(st.tuples(st.integers(0, 1), st.integers(0, 9), things), max_size=40)
 """Port, ns since the one before it, and what comes."""
@@ -113,6 +121,7 @@ def served(
     second: list[tuple[int, int, Frame | PortState]],
     takes: int,
     record: bool,
+    wake_at: int = 10,
 ) -> list[object]:
     """All that shows of a run: `first` comes at once, then `second`, when the channels take all that waits again."""
     now = 0
@@ -125,7 +134,7 @@ def served(
             channels[port].inbox.append((now, thing))
 
     come(first)
-    node = Diarist()
+    node = Diarist(wake_at)
     loop = RealTimeLoop(
         node,
         list(channels),
@@ -157,20 +166,48 @@ def test_records_are_served_as_frames_are(
     assert served(first, second, takes, record=False) == served(first, second, takes, record=True)
 
 
-def test_only_what_the_node_does_not_want_goes_as_a_record() -> None:
-    """A wake-up that is due comes first; what is looked at, disturbed or of another kind is handled."""
+@given(plain_traffic, plain_traffic, st.sampled_from((0, 1, 5, 1 << 30)))
+def test_runs_of_records_are_served_as_frames_are(
+    first: list[tuple[int, int, Frame | PortState]], second: list[tuple[int, int, Frame | PortState]], takes: int
+) -> None:
+    """The same where base data frames come alone and no wake-up is due, so that they go in runs."""
+    assert served(first, second, takes, False, NEVER) == served(first, second, takes, True, NEVER)
+
+
+def outcome(kinds: list[Frame], wake_at: int, sees_all: bool = False) -> tuple[int, int]:
+    """How many of those that come at 0, 1, ... ns go out on the other channel, and how many of them as records."""
     channels = [FakeRecordChannel(10, 100), FakeRecordChannel(11, 100)]
-    kinds = (LOOKED_AT, 7, DISTURBING, 7, CALMING, 7, 8)
-    channels[0].inbox = [(stamp, Frame(can_id, b"")) for stamp, can_id in enumerate(kinds)]
-    channels[0].inbox.append((8, Frame(7, b"", FLAG_EXTENDED)))
-    channels[0].inbox.append((11, Frame(7, b"")))  # behind the wake-up at 10
-    node = Diarist()
+    channels[0].inbox = list(enumerate(kinds))
+    node = Diarist(wake_at)
+    node.sees_all = sees_all
+    node.filter()
     loop = RealTimeLoop(
         node, list(channels), [0, 1], 0, clock=lambda: 12, wait=lambda readers, writers, _: (readers, writers)
     )
     turns = iter((False, True))
     loop.run(lambda _: next(turns))
-    assert len(channels[1].sent) == 9
-    assert channels[1].records == 3
-    assert node.wake_at == 20
-    assert node.wake_at < NEVER
+    return len(channels[1].sent), channels[1].records
+
+
+def base(*ids: int) -> list[Frame]:
+    return [Frame(can_id, b"") for can_id in ids]
+
+
+@pytest.mark.parametrize(
+    ("kinds", "wake_at", "records"),
+    [
+        (base(7, 8), NEVER, 2),
+        (base(7), NEVER, 1),
+        (base(LOOKED_AT), NEVER, 0),
+        (base(7, LOOKED_AT, 7, 8), NEVER, 3),
+        (base(7, CALMING, 7, 8), NEVER, 3),
+        (base(7, 8), 1, 2),  # at one instant a frame comes before a wake-up
+        (base(7, 8), 0, 0),  # a wake-up that is due between them
+        ([*base(7), Frame(7, b"", FLAG_EXTENDED)], NEVER, 0),
+    ],
+)
+def test_only_what_the_node_does_not_want_goes_as_a_record(kinds: list[Frame], wake_at: int, records: int) -> None:
+    """What is looked at, of another kind or comes with a wake-up that is due is handled; or all are."""
+    assert outcome(kinds, wake_at) == (len(kinds), records)
+    if CALMING not in [frame.can_id for frame in kinds]:
+        assert outcome(kinds, wake_at, sees_all=True) == (len(kinds), 0)

@@ -125,9 +125,7 @@ def test_error_frame_is_no_frame() -> None:
         (errno.EINVAL, "can0", ("cannot be opened",)),
     ],
 )
-def test_what_is_missing_is_said_in_one_line_with_the_remedy(
-    code: int, interface: str, words: tuple[str, ...]
-) -> None:
+def test_what_is_missing_is_said_in_one_line_with_the_remedy(code: int, interface: str, words: tuple[str, ...]) -> None:
     """Without SocketCAN rights: one line saying what to run."""
     message = str(interface_error(f"socketcan:{interface}", interface, OSError(code, "reason")))
     assert "\n" not in message
@@ -205,7 +203,7 @@ class ScriptedSocket(socket.socket):
 @pytest.fixture
 def scripted(monkeypatch: pytest.MonkeyPatch) -> Iterator[Wire]:
     """Read by recvmsg, for which a ScriptedSocket can stand in."""
-    monkeypatch.setattr(recvmmsg, "find_recvmmsg", lambda: None)
+    monkeypatch.setattr(recvmmsg, "find_call", lambda *_: None)
     wire = Wire()
     yield wire
     wire.close()
@@ -215,7 +213,7 @@ def scripted(monkeypatch: pytest.MonkeyPatch) -> Iterator[Wire]:
 def wire(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[Wire]:
     """Both ways to read."""
     if request.param == "recvmsg":
-        monkeypatch.setattr(recvmmsg, "find_recvmmsg", lambda: None)
+        monkeypatch.setattr(recvmmsg, "find_call", lambda *_: None)
     wire = Wire()
     yield wire
     wire.close()
@@ -387,20 +385,27 @@ def test_batch_holds_what_one_by_one_holds(records: list[bytes]) -> None:
 
 @linux
 def test_records_are_those_that_came_and_go_out_again_unchanged(wire: Wire) -> None:
-    """Base data frames as records with id and stamp; all else as arrivals."""
-    given_ = [encode(Frame(0x100 + number, bytes(number))) for number in range(9)]
-    other = encode(Frame(0x100, b"\1", FLAG_EXTENDED))
-    for record in (*given_, other):
+    """Base data frames with id and stamp, kept until the next reading; all else as arrivals."""
+    frames = [Frame(0x100 + number, bytes(number)) for number in range(9)]
+    records = [encode(frame) for frame in frames]
+    for record in records:
         wire.feed(record)
-    found = wire.channel.receive_records(1)
-    assert [record for _, _, _, record, _ in found] == [*given_, b""]
-    assert [(place, can_id) for _, place, can_id, _, _ in found] == [(1, 0x100 + n) for n in range(9)] + [(1, -1)]
-    last = found[-1][4]
-    assert last is not None
-    assert last.frame == Frame(0x100, b"\1", FLAG_EXTENDED)
-    assert wire.channel.frame_in(given_[5]) == Frame(0x105, bytes(5))
-    assert wire.channel.send_record(found[3][3])
-    assert wire.other.recv(100) == given_[3]
+    plain = wire.channel.read()
+    assert wire.channel.count == 9
+    assert [wire.channel.arrival(number).frame for number in range(9)] == frames
+    if plain:  # stamped and read by recvmmsg
+        assert wire.channel.ids == [frame.can_id for frame in frames]
+        assert wire.channel.stamps == [wire.channel.arrival(number).stamp_ns for number in range(9)]
+        other = Wire()
+        assert other.channel.send_run(wire.channel, 3, 4) == 1
+        assert other.channel.send_run(wire.channel, 2, 9) in (0, 7)
+        assert other.other.recv(100) == records[3]
+        other.close()
+    wire.feed(records[0])
+    wire.feed(encode(Frame(0x100, b"\1", FLAG_EXTENDED)))
+    assert not wire.channel.read()
+    kinds = [wire.channel.arrival(number).frame for number in range(2)]
+    assert kinds == [frames[0], Frame(0x100, b"\1", FLAG_EXTENDED)]
 
 
 def test_full_socket_would_block(wire: Wire) -> None:

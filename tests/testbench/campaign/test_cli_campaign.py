@@ -45,7 +45,13 @@ def exo_hil(folder: Path, *arguments: str, maker: str = "") -> subprocess.Popen[
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
+        start_new_session=True,
     )
+
+
+def interrupt(process: subprocess.Popen[str]) -> None:
+    """Ctrl-C as a terminal has it: for the program and all of its processes."""
+    os.killpg(process.pid, signal.SIGINT)
 
 
 def rows_in(path: Path) -> list[RunRow]:
@@ -153,6 +159,32 @@ def test_runs_without_a_statement_are_told_and_exit_3(
     assert "crashed" not in capsys.readouterr().out
 
 
+def test_changes_are_another_experiment(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fake: Callable[[str], None]
+) -> None:
+    """--set: a store of its own by default, so that pins on and pins off are not mixed."""
+    fake("quick")
+    monkeypatch.chdir(tmp_path)
+    for changes in ([], ["--set", "rig.stops=on"]):
+        assert main(["campaign", "run", str(written(tmp_path)), "--no-report", "--runs", "1", *changes]) == 0
+    plain, changed = sorted((tmp_path / "results" / "campaigns").glob("*.sqlite"), key=lambda path: len(path.name))
+    assert plain.name == "small.sqlite"
+    assert changed.name.startswith("small-")
+    assert {row.identity for row in rows_in(plain)}.isdisjoint(row.identity for row in rows_in(changed))
+
+
+def test_report_is_written_where_asked(tmp_path: Path, fake: Callable[[str], None]) -> None:
+    """Of a store alone: the campaign file and its scenario may be gone."""
+    fake("quick")
+    store, path = tmp_path / "s.sqlite", written(tmp_path)
+    assert main(["campaign", "run", str(path), "--out", str(store), "--no-report"]) == 0
+    path.unlink()
+    html, junit = tmp_path / "a" / "r.html", tmp_path / "b" / "r.xml"
+    assert main(["campaign", "report", str(store), "--html", str(html), "--junit", str(junit)]) == 0
+    assert "two durations" in html.read_text(encoding="utf-8")
+    assert junit.read_text(encoding="utf-8").startswith("<?xml")
+
+
 def test_export_writes_all_runs(tmp_path: Path, fake: Callable[[str], None]) -> None:
     fake("quick")
     store = str(tmp_path / "s.sqlite")
@@ -221,7 +253,7 @@ def test_check_says_what_a_campaign_will_do(tmp_path: Path, capsys: pytest.Captu
     assert main(["check", str(path)]) == 0
     out = capsys.readouterr().out
     assert "axis duration: 0.05 s, 0.3 s (2 values), sets injectors.freeze.effect.duration, inj" in out
-    assert "2 points; 3 runs a point\nruns: 6; run k of every point has seed 5 + k\n" in out
+    assert "2 points; 3 runs a point\nruns: 6; run k of every point has seed 5 + k\ntime: known when" in out
     assert main(["check", str(path), "--set", "rig.stops=maybe"]) == 2
     assert main(["check", str(path), "--seed", "3"]) == 2
     assert main(["check", str(written(tmp_path, ("runs: 3", "runs: 0")))]) == 2
@@ -250,13 +282,13 @@ def test_ctrl_c_keeps_what_was_made_and_leaves_nobody(tmp_path: Path) -> None:
     arguments = ("campaign", "run", str(path), "--out", str(store), "--jobs", "2")
     process = exo_hil(tmp_path, *arguments, maker="hangs_from_3")
     once(process, lambda: has_rows(store, 3) and len(worker_numbers(tmp_path)) == 2)
-    process.send_signal(signal.SIGINT)
+    interrupt(process)
     assert process.stderr is not None
     for line in process.stderr:
         if "Ctrl-C again drops them" in line:
             break
-    process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=60)
+    interrupt(process)
+    out, err = process.communicate(timeout=300)
     if process.poll() is None or process.returncode != 130:
         raise AssertionError((process.returncode, out, err))
     assert "interrupted; the same command goes on from here: 3 runs are in" in err
@@ -264,7 +296,7 @@ def test_ctrl_c_keeps_what_was_made_and_leaves_nobody(tmp_path: Path) -> None:
     assert len(rows_in(store)) == 3
     assert not [number for number in worker_numbers(tmp_path) if is_alive(number)]
     process = exo_hil(tmp_path, *arguments, "--no-report", maker="quick")
-    out, err = process.communicate(timeout=120)
+    out, err = process.communicate(timeout=300)
     assert process.returncode == 0, err
     assert "12 of 12 runs; 9 made" in out
 
@@ -277,11 +309,11 @@ def test_workers_leave_when_the_runner_is_killed(tmp_path: Path) -> None:
     workers = worker_numbers(tmp_path)
     assert all(is_alive(number) for number in workers)
     process.kill()
-    process.communicate(timeout=60)  # ends when nobody holds its pipes any more: the workers are gone, too
+    process.communicate(timeout=300)  # ends when nobody holds its pipes any more: the workers are gone, too
     assert not [number for number in workers if is_alive(number)]
     done = exo_hil(tmp_path, "campaign", "status", str(store))
-    out, err = done.communicate(timeout=60)
-    assert "small: killed; 3 of 12 runs" in out, err
+    out, err = done.communicate(timeout=300)
+    assert "small: broken off; 3 of 12 runs" in out, err
     assert len(rows_in(store)) == 3
 
 
@@ -301,7 +333,7 @@ def test_one_process_two_processes_and_resumed_after_kill_give_the_same_rows(tmp
     process = exo_hil(tmp_path, *command(stores[2], 2))
     once(process, lambda: has_rows(stores[2], 2))
     process.kill()
-    process.communicate(timeout=60)
+    process.communicate(timeout=300)
     kept = {row.identity for row in rows_in(stores[2])}
     assert 2 <= len(kept) < 6
     done = exo_hil(tmp_path, *command(stores[2], 2))
@@ -318,8 +350,10 @@ def test_one_process_two_processes_and_resumed_after_kill_give_the_same_rows(tmp
 def test_replay_makes_a_run_again_with_everything(tmp_path: Path) -> None:
     """The same trace hash, in a result folder as `exo-hil run` writes it."""
     store, folder = tmp_path / "s.sqlite", tmp_path / "again"
-    run = ("campaign", "run", str(written(tmp_path)), "--out", str(store), "--runs", "1", "--no-report")
-    assert main(list(run)) == 0
+    path = written(tmp_path, ("seed: 5", "seed: 5\ntraces: always"))
+    assert main(["campaign", "run", str(path), "--out", str(store), "--runs", "1", "--no-report"]) == 0
+    kept = {entry.name for entry in (tmp_path / "s-runs").iterdir()}
+    assert kept == {row.identity[:16] for row in rows_in(store)}
     done = exo_hil(tmp_path, "campaign", "replay", str(store), "2/0", "--out", str(folder), "--json")
     out, err = done.communicate(timeout=300)
     assert done.returncode == 0, err
@@ -330,6 +364,9 @@ def test_replay_makes_a_run_again_with_everything(tmp_path: Path) -> None:
     summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
     assert summary["trace_hash"]["faulted"] == row.trace_hash
     assert {"fault.png", "faulted.parquet", "drive.log"} <= {entry.name for entry in folder.iterdir()}
+    there = tmp_path / "s-runs" / row.identity[:16]
+    assert (there / "injections.csv").read_bytes() == (folder / "injections.csv").read_bytes()
+    assert (there / "drive.log").read_bytes() == (folder / "drive.log").read_bytes()
     done = exo_hil(tmp_path, "campaign", "replay", str(store), "9/0")
-    assert "points 1..2" in done.communicate(timeout=60)[1]
+    assert "points 1..2" in done.communicate(timeout=300)[1]
     assert done.returncode == 2

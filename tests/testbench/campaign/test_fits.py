@@ -66,7 +66,7 @@ def test_known_noise_is_covered() -> None:
     inside, variances = 0, []
     for _ in range(2000):
         found = quadratic_fit(list(x), list(curve(x) + 0.3 * generator.normal(size=x.size)))
-        inside += found.band(0.4).low <= curve(np.array(0.4)) <= found.band(0.4).high
+        inside += bool(found.band(0.4).low <= curve(np.array(0.4)) <= found.band(0.4).high)
         assert found.sd is not None
         variances.append(found.sd**2)
     assert abs(inside / 2000 - 0.95) < 0.02

@@ -1,16 +1,23 @@
 """A run that starts from a snapshot of its golden run comes out as one that starts at power-up, bit for bit."""
 
 import dataclasses
+from enum import Enum
+from functools import partial
 
 import pytest
+from numpy.random import Generator
 
 from canopen_exo.bus.node import MS
+from canopen_exo.bus.trace import trace_hash
+from canopen_exo.plan import BusPlan
+from fi_gateway.schema import build_injectors
 from testbench.campaign.early import LOOK_NS
 from testbench.campaign.execute import Workshop, make_run
-from testbench.campaign.fork import SNAPSHOT_NS
+from testbench.campaign.fork import SNAPSHOT_NS, snapshot_distance
 from testbench.campaign.records import Outcome, RunRow, RunSpec
+from testbench.rig import RigParams, build_rig
 from testbench.run import CHUNK_NS, rig_params
-from testbench.scenario import parse_scenario
+from testbench.scenario import default_joints, parse_scenario
 from tests.testbench.campaign.specs import spec
 
 pytestmark = pytest.mark.run
@@ -59,7 +66,7 @@ EVENTS = {
     "at_time_zero": one(POSITION, "type: bias, value: 2 deg", "{type: at, time: 0 s}"),
     "several_times": one(POSITION, "type: bias, value: 2 deg", "{type: at, times: [1.8 s, 1.2 s, 1.25 s]}"),
     "probability": one(POSITION, "type: stuck_at", "{type: failure_probability, p: 0.001, per: 1 ms}"),
-    "per_frame": one(POSITION, "type: stuck_at", "{type: failure_probability, p: 0.2 %, per: frame}"),
+    "per_frame": one(POSITION, "type: stuck_at", "{type: failure_probability, p: 1 %, per: frame}"),
     "rate": one(POSITION, "type: bias, value: 2 deg", "{type: rate, lambda: 1 1/s}"),
     "mttf": one(POSITION, "type: bias, value: 2 deg", "{type: mttf, mean: 1 s, sd: 0.3 s}"),
     "drawn": one(
@@ -142,6 +149,39 @@ def test_so_is_the_papers_experiment_with_pins_and_without(stops: str, seed: int
     assert timeless(straight) == timeless(forked)
 
 
+@pytest.mark.parametrize("name", ["probability", "every", "gait_phase", "when_level", "late_power_up", "by_frame"])
+def test_the_gateway_of_a_branch_stands_where_that_of_a_straight_run_does(name: str, workshop: Workshop) -> None:
+    """Random streams, held values, counters, time 0 and timers, at the instant of the snapshot."""
+    scenario = parse_scenario(spec("golden", SHORT, f"injectors={{{ALL[name]}}}", seed=5).scenario)
+    params = rig_params(scenario)
+    trunk = workshop.golden(params, fork=True)
+    make = partial(build_injectors, scenario.injectors, params.plan, scenario.seed, 0)
+    snapshot = trunk.before(min(trunk.first_activation(make(), params.plan.cycle_ns), 2000 * MS))
+    assert snapshot is not None
+    branch, straight = trunk.branch(snapshot, make()), build_rig(params, make())
+    straight.loop.run_until(snapshot.now)
+    assert state(branch.gateway) == state(straight.gateway)
+    assert trace_hash(branch.loop.trace) == trace_hash(straight.loop.trace)
+    assert branch.rack.plant.q == straight.rack.plant.q
+    assert len(branch.rack.truth) == len(straight.rack.truth)
+
+
+def state(thing: object) -> object:
+    """All that `__reduce__` says, all the way down, as plain values."""
+    if isinstance(thing, Generator):
+        return thing.bit_generator.state
+    if isinstance(thing, type):
+        return thing.__name__
+    if isinstance(thing, list | tuple):
+        return [state(one) for one in thing]
+    if isinstance(thing, dict):
+        return {key: state(value) for key, value in thing.items()}
+    if isinstance(thing, int | float | str | bytes | bytearray | Enum) or thing is None:
+        return thing
+    made = thing.__reduce_ex__(4)
+    return [type(thing).__name__, *(state(part) for part in made[1:3])] if not isinstance(made, str) else made
+
+
 def test_a_fault_that_acts_from_power_up_is_run_straight_and_says_so(workshop: Workshop) -> None:
     """No snapshot lies before its first activation."""
     early = one("{bus: to_controller, kind: heartbeat}", "type: drop", "{type: at, time: 0.1 s}",
@@ -193,6 +233,16 @@ def test_snapshots_and_looks_lie_where_the_loop_pauses() -> None:
     assert SNAPSHOT_NS % CHUNK_NS == 0
     assert CHUNK_NS % LOOK_NS == 0
     assert LOOK_NS % MS == 0
+
+
+@pytest.mark.parametrize(
+    ("duration_s", "distance_ms"), [(1, 200), (7, 200), (11, 200), (12, 400), (60, 1000), (3600, 56_400)]
+)
+def test_the_number_of_snapshots_is_bounded_however_long_the_motion(duration_s: int, distance_ms: int) -> None:
+    """They lie further apart then."""
+    plan = BusPlan(default_joints())
+    params = RigParams(plan, stops=False, stride_ns=1500 * MS, duration_ns=duration_s * 1000 * MS)
+    assert snapshot_distance(params) == distance_ms * MS
 
 
 @pytest.mark.parametrize("grace_s", [0.0, 0.05, 0.2])

@@ -32,7 +32,7 @@ def test_the_end_of_a_stride_is_the_start_of_the_next() -> None:
 def test_the_last_bin_wraps_around() -> None:
     """Edges at 0.05, 0.15, ..., 0.95: a phase of 0.02 and one of 0.97 lie in the last bin."""
     bins = by_phase([(0.02, FAIL), (0.97, PASS), (1.0, PASS), (0.05, FAIL)], "failure", bins=10, first=0.05)
-    assert (bins[-1].low, bins[-1].high) == (pytest.approx(0.95), pytest.approx(1.05))
+    assert (bins[-1].low, bins[-1].high) == pytest.approx((0.95, 1.05))
     assert bins[-1].tally == Tally(1, 3)
     assert bins[0].tally == Tally(1, 1)
 

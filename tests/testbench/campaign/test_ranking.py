@@ -34,12 +34,14 @@ def test_effects_are_those_of_scipy() -> None:
     ranking = rank_parameters({"x": list(x), "name": [str(one) for one in names]}, list(y))
     rho, p = stats.spearmanr(x, y)
     number = effect(ranking, "x")
-    assert (number.rho, number.p_value) == (pytest.approx(rho), pytest.approx(p))
+    assert number.rho == pytest.approx(rho)
+    assert number.p_value == pytest.approx(p)
     assert number.strength == pytest.approx(1 - (1 - rho**2) * (N - 1) / (N - 2))
     assert number.eta_squared is None
     h, p = stats.kruskal(*[y[names == one] for one in "abc"])
     name = effect(ranking, "name")
-    assert (name.strength, name.p_value) == (pytest.approx((h - 2) / (N - 3)), pytest.approx(p))
+    assert name.strength == pytest.approx((h - 2) / (N - 3))
+    assert name.p_value == pytest.approx(p)
     assert (name.rho, name.interval, name.numeric, name.levels) == (None, None, False, 3)
 
 
@@ -75,13 +77,13 @@ def test_a_parameter_that_matters_without_rising_or_falling_is_found() -> None:
 
 @pytest.mark.parametrize("kind", ["metric", "outcome"])
 def test_p_values_and_strengths_are_right_where_nothing_matters(kind: str) -> None:
-    """1000 campaigns: p below 0.05 in 5 %, twice the smaller one in at most that; mean strength about 0."""
+    """300 campaigns: p below 0.05 in 5 % (twice the smaller one: at most that); mean strength about 0."""
     generator = np.random.default_rng(25)
     low, strengths = {"x": 0, "level": 0}, []
-    for _ in range(1000):
-        y = generator.random(40) if kind == "metric" else (generator.random(40) < 0.3).astype(float)
+    for _ in range(300):
+        y = generator.random(20) if kind == "metric" else (generator.random(20) < 0.4).astype(float)
         ranking = rank_parameters(
-            {"x": list(generator.random(40)), "level": [float(one) for one in generator.integers(0, 3, 40)]}, list(y)
+            {"x": list(generator.random(20)), "level": [float(one) for one in generator.integers(0, 3, 20)]}, list(y)
         )
         for name in low:
             found = effect(ranking, name)
@@ -89,24 +91,24 @@ def test_p_values_and_strengths_are_right_where_nothing_matters(kind: str) -> No
             low[name] += found.p_value < 0.05
         x = effect(ranking, "x")
         strengths.append(x.strength)
-    assert 0.03 < low["x"] / 1000 < 0.07
-    assert 0.01 < low["level"] / 1000 < 0.065
-    assert np.mean(np.array(strengths, dtype=float)) == pytest.approx(0, abs=0.005)
+    assert 0.015 < low["x"] / 300 < 0.09
+    assert 0 < low["level"] / 300 < 0.085
+    assert np.mean(np.array(strengths, dtype=float)) == pytest.approx(0, abs=0.02)  # 4 standard errors
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.5, 0.8])
 def test_the_interval_of_rho_covers(rho: float) -> None:
-    """300 campaigns of 80 binormal runs: 92 to 98 %; the true rank correlation is 6 / pi asin(rho / 2)."""
+    """150 campaigns of 40 binormal runs: 90 to 99 %; the true rank correlation is 6 / pi asin(rho / 2)."""
     generator = np.random.default_rng(26)
     true = 6 / math.pi * math.asin(rho / 2)
     inside = 0
-    for _ in range(300):
-        x, other = generator.normal(size=(2, 80))
+    for _ in range(150):
+        x, other = generator.normal(size=(2, 40))
         y = rho * x + math.sqrt(1 - rho**2) * other
         interval = effect(rank_parameters({"x": list(x)}, list(y)), "x").interval
         assert interval is not None
         inside += interval.low <= true <= interval.high
-    assert 0.92 <= inside / 300 <= 0.98
+    assert 0.90 <= inside / 150 <= 0.99
 
 
 def test_runs_that_share_seeds_widen_the_interval_and_have_no_p_value() -> None:
@@ -155,7 +157,8 @@ def test_parameters_of_a_grid_are_separable() -> None:
 def test_an_order_that_is_complete_has_no_interval() -> None:
     """|rho| = 1: the data show no spread to judge by."""
     found = effect(rank_parameters({"x": list(range(20))}, list(range(20))), "x")
-    assert (found.rho, found.interval) == (pytest.approx(1), None)
+    assert found.rho == pytest.approx(1)
+    assert found.interval is None
     assert found.strength == pytest.approx(1)
 
 

@@ -10,7 +10,7 @@ from testbench.campaign.executor import Executor
 from testbench.campaign.records import Known, Outcome, Plan, Point, RunRow, RunSpec, Wanted
 from testbench.campaign.runner import Finished, Progress, Runner, Way
 from testbench.campaign.schema import Campaign
-from testbench.campaign.store import Store, open_store
+from testbench.campaign.store import Store, StoreError, open_store
 from tests.testbench.campaign.campaigns import small
 from tests.testbench.campaign.workers import row_of
 
@@ -181,6 +181,22 @@ def test_plan_is_asked_again_as_runs_come_in(store: Store) -> None:
     assert (specs, finished.reused) == ([], 3)
 
 
+class Twins(Plan):
+    """Two points that are one scenario, as a search may come upon them, and one more."""
+
+    def wanted(self, known: Known) -> list[Wanted]:
+        return [Wanted(Point((("duration", text),)), 0) for text in ("0.05 s", "50 ms", "0.3 s")]
+
+
+@pytest.mark.parametrize("room", [1, 5])
+def test_points_that_are_one_scenario_share_a_run(store: Store, room: int) -> None:
+    """Never the same run twice; both points know it."""
+    finished, specs = run(small(), store, Here(room=room), plan=Twins())
+    assert len({spec.identity for spec in specs}) == len(specs) == 2
+    assert finished.progress.done == 3
+    assert not finished.interrupted
+
+
 def test_rows_are_the_same_in_whatever_order_runs_finish(store: Store, tmp_path: Path) -> None:
     """A sequential rule on one process and on seven."""
     rule = "runs: {until: {outcome: failure, width: 0.5}, batch: 4, least: 4, most: 40}"
@@ -210,6 +226,22 @@ def test_failing_executor_keeps_what_was_made(store: Store) -> None:
         runner.run(executor, lambda progress: None, lambda: 0)
     assert executor.is_stopped
     assert len(store.runs.all()) == 2
+
+
+def test_full_disk_stops_the_campaign_and_keeps_what_was_made(store: Store) -> None:
+    """A clear message, processes stopped, and every run that was counted is there."""
+    campaign = small(("runs: 3", "runs: 500"))
+    runner = Runner(campaign, store, WAY)
+    runner.prepare()
+    pages = store.database.connection.execute("PRAGMA page_count").fetchone()[0]
+    store.database.connection.execute(f"PRAGMA max_page_count = {pages + 20}")
+    executor = Here()
+    made: list[Progress] = []
+    with pytest.raises(StoreError, match="the disk is full; make room"):
+        runner.run(executor, made.append, lambda: 0)
+    assert executor.is_stopped
+    assert len(store.runs.all()) == made[-1].made > 1
+    assert store.invocations.all()[0].how == "running"
 
 
 def test_progress_tells_rate_and_time_left() -> None:

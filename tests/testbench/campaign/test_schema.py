@@ -190,6 +190,10 @@ def test_changes_and_runs_of_the_command_line(tmp_path: Path) -> None:
     assert "stops: 'on'" in campaign.scenario_text(campaign.points[0])
     with pytest.raises(FileErrors, match=r"^--set rig\.stop=on: .*did you mean 'stops'"):
         load_campaign(path, ["rig.stop=on"])
+    searching = written(tmp_path, ("runs: 3", "search: {combinations: {injectors: [freeze, zero]}}"))
+    with pytest.raises(FileErrors, match=r"^--runs 7: runs: give one of the two, runs or search"):
+        load_campaign(searching, (), 7)
+    path = written(tmp_path)
     with pytest.raises(FileErrors, match=r"^--runs 200000: runs: expected"):
         load_campaign(path, (), 200_000)
 

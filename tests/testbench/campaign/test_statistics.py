@@ -233,3 +233,20 @@ def test_an_interval_is_in_order() -> None:
     for low, high in ((1.0, 0.0), (math.nan, 1.0), (0.0, math.nan)):
         with pytest.raises(ValueError, match="low must not be above high"):
             Interval(low, high, 0.95, "")
+
+
+def test_stopping_when_the_interval_is_narrow_costs_little_coverage() -> None:
+    """docs/statistics.md: batches of 20, at most 400, width 0.1: exactly summed, mean 95.2 %, at worst 90.5 %."""
+    shares, found = np.linspace(0.0025, 0.9975, 200), []
+    intervals = {n: [wilson(k, n) for k in range(n + 1)] for n in range(20, 401, 20)}
+    for share in shares:
+        going, covered = np.ones(1), 0.0
+        for n, ends in intervals.items():
+            going = np.convolve(going, stats.binom.pmf(np.arange(21), 20, share))
+            stops = np.array([one.width <= 0.1 or n == 400 for one in ends])
+            holds = np.array([one.low <= share <= one.high for one in ends])
+            covered += float(going[stops & holds].sum())
+            going = np.where(stops, 0, going)
+        found.append(covered)
+    assert float(np.mean(found)) == pytest.approx(0.952, abs=0.0005)
+    assert min(found) == pytest.approx(0.905, abs=0.0005)

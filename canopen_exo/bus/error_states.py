@@ -1,0 +1,116 @@
+"""The error states of the ports of a medium: what follows from their counters, and who is off the bus.
+
+Source: ISO 11898-1, fault confinement (`confinement` has the rules); linux/can/error.h for how a change shows in the
+trace. What bus-off does to queued frames is what Linux does: the interface goes down, so the queue is emptied, and what
+is sent until the restart is lost (`Port.lost`).
+"""
+
+from typing import Final, final
+
+from canopen_exo.bus.confinement import BUS_OFF_LIMIT, state_of
+from canopen_exo.bus.error_frame import write_error_frame
+from canopen_exo.bus.frame import FLAG_ERROR, FLAG_EXTENDED, FLAG_REMOTE, Frame
+from canopen_exo.bus.medium import Medium, Port, WireEvent
+from canopen_exo.bus.node import NEVER, ErrorState, Node, PortState
+from canopen_exo.bus.recovery import Recovery, is_present
+
+_CLOSED: Final = [(Frame(0x1FFFFFFF, b"", FLAG_EXTENDED | FLAG_REMOTE), Port(Medium("none", 0, 1), Node(), 0))]
+"""The queue of a port that is bus-off: nothing can be put behind what is in it."""
+
+
+@final
+class ErrorStates:
+    """Of the ports of one medium. absent: ports that are bus-off or unplugged; recoveries: on their way back."""
+
+    def __init__(self, medium: Medium) -> None:
+        self.medium: Final[Medium] = medium
+        self.absent: int = 0
+        self.recoveries: list[Recovery] = []
+
+    def count(self, now: int, port: Port, tec: int, rec: int, events: list[WireEvent]) -> None:
+        """New counters of a port, and what follows from them."""
+        cause = "transmit errors" if tec > port.tec else "receive errors" if rec > port.rec else "frames without error"
+        port.tec, port.rec = tec, rec
+        state = state_of(tec, rec)
+        if state is not port.state and is_present(port):
+            self._change(port, state, cause, events)
+            if state is ErrorState.BUS_OFF:
+                self._go_off(now, port)
+
+    def switch_off(self, now: int, port: Port, events: list[WireEvent]) -> None:
+        """Make a port that takes part bus-off, whatever its counters; it restarts as from any bus-off."""
+        port.tec = BUS_OFF_LIMIT
+        self._change(port, ErrorState.BUS_OFF, "switched off", events)
+        self._go_off(now, port)
+
+    def request(self, port: Port, at_ns: int) -> None:
+        """Ask a port to restart at `at_ns`, unless it was asked before."""
+        for recovery in self.recoveries:
+            if recovery.port is port:
+                return
+        self.recoveries.append(Recovery(port, at_ns))
+
+    def unplug(self, port: Port) -> None:
+        """Its node is gone: what waits is lost, and it is not asked to restart any more."""
+        if is_present(port):
+            self._close(port)
+        self.recoveries = [one for one in self.recoveries if one.port is not port]
+        port.state = ErrorState.DOWN
+
+    def plug(self, now: int, port: Port) -> None:
+        """A node is there where one was unplugged."""
+        self._open(now, port)
+        port.state = ErrorState.ERROR_ACTIVE
+
+    def hear(self, free_ns: int, now: int) -> None:
+        """The bus was recessive from `free_ns` to `now`, when a frame begins."""
+        for recovery in self.recoveries:
+            recovery.count(free_ns, now, self.medium.bit_ns)
+
+    def next_ns(self, free_ns: int) -> int:
+        """When the first port is back unless another frame begins; NEVER for none."""
+        at = NEVER
+        for recovery in self.recoveries:
+            at = min(at, recovery.done_ns(free_ns, self.medium.bit_ns))
+        return at
+
+    def finish(self, now: int, free_ns: int, events: list[WireEvent]) -> None:
+        """Restart the ports that have seen enough recessive bits; the bus is idle."""
+        left: list[Recovery] = []
+        for recovery in self.recoveries:
+            if recovery.done_ns(free_ns, self.medium.bit_ns) > now:
+                left.append(recovery)
+                continue
+            self._open(now, recovery.port)
+            self._change(recovery.port, ErrorState.ERROR_ACTIVE, "controller restarted", events)
+        self.recoveries = left
+
+    def _go_off(self, now: int, port: Port) -> None:
+        """Nothing is sent or received until the restart; what waits is lost."""
+        self._close(port)
+        if port.restart_ns != NEVER:
+            self.recoveries.append(Recovery(port, now + port.restart_ns))
+
+    def _change(self, port: Port, state: ErrorState, cause: str, events: list[WireEvent]) -> None:
+        restarted = port.state is ErrorState.BUS_OFF
+        port.state = state
+        notice = PortState(port.number, state, port.tec, port.rec, cause)
+        can_id, data = write_error_frame(notice, restarted)
+        events.append(WireEvent(Frame(can_id, data, FLAG_ERROR), port, [], notice))
+
+    def _close(self, port: Port) -> None:
+        waiting = self.medium.waiting
+        kept = [entry for entry in waiting if entry[1] is not port]
+        port.lost += len(waiting) - len(kept)
+        waiting[:] = kept
+        port.waiting = _CLOSED
+        self.absent += 1
+
+    def _open(self, now: int, port: Port) -> None:
+        port.tec = port.rec = 0
+        port.ready_ns = now
+        port.waiting = self.medium.waiting
+        self.absent -= 1
+
+    def __reduce__(self) -> tuple[type["ErrorStates"], tuple[Medium], dict[str, object]]:
+        return ErrorStates, (self.medium,), {"absent": self.absent, "recoveries": self.recoveries}
