@@ -9,7 +9,7 @@ processes of a rig share; only this module and the channels read it. Between two
 4. sends what had to wait; 5. calls the further readers (live control).
 
 A Relay between two channels that carry records (SocketCAN) is served in the same order, but frames it would only pass
-on go as the records that came (`shortcut`). With a trace to keep, every frame is made and handled.
+on go as the records that came (`realtime_relay`). With a trace to keep, every frame is made and handled.
 
 `now` never goes back for a frame: one whose stamp is older than what was served already gets that time (its trace row
 keeps the stamp). Deviation from the lock-step order: within one channel frames keep the order in which they came, also
@@ -33,8 +33,8 @@ from canopen_exo.bus.losses import Losses
 from canopen_exo.bus.medium import Transmission
 from canopen_exo.bus.node import MS, NEVER, SECOND, Node, PortState, Relay
 from canopen_exo.bus.realtime_out import Line, RealTimeOut
+from canopen_exo.bus.realtime_relay import ShortCut
 from canopen_exo.bus.scheduling import request_fifo, sharpen_timers
-from canopen_exo.bus.shortcut import ShortCut
 from canopen_exo.errors import CanopenExoError
 
 __all__ = ["RECEIVED", "Lateness", "Readable", "RealTimeLoop", "RealTimeOut", "request_fifo"]
