@@ -144,7 +144,10 @@ class Cluster(Executor):
         self._flying[future] = spec
 
     def collect(self, timeout_s: float) -> list[RunRow]:
-        """What has finished. Raises ExecutorError when the scheduler is gone, or a worker has other code."""
+        """What has finished.
+
+        Raises ExecutorError when the scheduler is gone, or a worker has other code, or none that can make runs.
+        """
         if self._flying:
             with suppress(TimeoutError), self._client.as_current():
                 distributed.wait(list(self._flying), timeout=timeout_s, return_when="FIRST_COMPLETED")
@@ -181,7 +184,10 @@ class Cluster(Executor):
             raise ExecutorError(f"--cluster {self._address}: run {spec.identity[:12]} was {future.status} there")
         error = future.exception()
         if not isinstance(error, distributed.KilledWorker):
-            return given_up(spec, Outcome.CRASHED, f"{type(error).__name__}: {error}", 1, 0.0, "")
+            raise ExecutorError(
+                f"--cluster {self._address}: a worker cannot make runs ({type(error).__name__}: {error}); install the "
+                "same commit of exo-hil, with its extras, on every worker"
+            )
         attempts = error.allowed_failures + 1
         if spec.identity in {said for _, said in self._client.get_events(HUNG)}:
             reason = f"not finished after {spec.time_limit_s:g} s; its worker ended itself, {attempts} times in a row"

@@ -24,6 +24,7 @@ from canopen_exo.bus.error_frame import read_error_frame
 from canopen_exo.bus.frame import FLAG_ERROR
 from canopen_exo.bus.medium import Transmission
 from canopen_exo.bus.node import ErrorState
+from canopen_exo.bus.realtime import RECEIVED
 from canopen_exo.emcy import NO_ERROR, decode_emcy
 from canopen_exo.plan import EMCY
 from hlc.limits import JointLimits
@@ -83,9 +84,12 @@ def first_reaction(record: RunRecord, after_s: float) -> float | None:
 
 
 def _is_drives_reaction(row: Transmission, drives: int) -> bool:
-    """An EMCY that a drive sent, or its bus-off. Port 0 of the drive bus is the gateway, whose forgeries are none."""
+    """An EMCY that a drive sent, or its bus-off. Port 0 of the drive bus is the gateway, whose forgeries are none.
+
+    Against the clock the trace is the gateway's: what it has received on the drive bus is from the drives.
+    """
     frame = row.frame
-    if not 1 <= row.sender <= drives:
+    if not (1 <= row.sender <= drives or row.sender == RECEIVED):
         return False
     if frame.flags == 0:
         if not EMCY < frame.can_id <= EMCY + 0x7F:

@@ -10,13 +10,15 @@ No two runs against the clock are alike: here the same identity says what was as
 import platform
 import time
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final, final
 
+from canopen_exo.bus.node import NEVER
 from canopen_exo.bus.trace import trace_hash
-from fi_gateway.control_socket import ask
+from fi_gateway.control_socket import ask, ask_listing
 from fi_gateway.errors import FaultError
 from fi_gateway.schema import refuse_wire_faults
 from testbench.campaign.execute import Pair, judged
@@ -30,7 +32,7 @@ from testbench.rig import RigParams
 from testbench.run import judge_pair, rig_params
 from testbench.scenario import Scenario, parse_scenario
 from testbench.summary import versions
-from testbench.supervisor import Setup, Supervisor
+from testbench.supervisor import Setup
 from testbench.timing import TimingLimits
 
 
@@ -120,12 +122,8 @@ class OverBus(Executor):
         disarmed = {name: replace(one, enabled=False) for name, one in scenario.injectors.items()}
         armed = [name for name, one in scenario.injectors.items() if one.enabled]
 
-        def arm(rig: Supervisor) -> None:
-            for name in armed:
-                ask(rig.control_address, "arm", name)
-
         setup = replace(self._setup(scenario), scenario=replace(scenario, injectors=disarmed), faults=True)
-        faulted = run_once(setup, when_ready=arm)
+        faulted = run_once(setup, when_ready=lambda rig: arm(rig.control_address, armed))
         record = _ended(faulted.record, spec, scenario, golden.record)
         judgement = judge_pair(scenario, golden.record, record)
         pair = Pair(golden.record, trace_hash(golden.record.rows), record, trace_hash(record.rows))
@@ -157,6 +155,17 @@ class OverBus(Executor):
             fifo=one.fifo,
             listen=one.listen,
             control=one.control,
+        )
+
+
+def arm(address: str, injectors: Sequence[str]) -> None:
+    """Arm them over live control. Raises BenchError when time 0 was before: what was due since then is lost."""
+    for name in injectors:
+        ask(address, "arm", name)
+    if injectors and ask_listing(address).time_zero_ns != NEVER:
+        raise BenchError(
+            "the injectors were armed after time 0, so that some faults may be missing: the machine was too slow, or a "
+            "foreign controller was walking before the rig was heard"
         )
 
 

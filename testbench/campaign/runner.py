@@ -108,6 +108,7 @@ class Runner:
         self._plan: Final[Plan] = plan_of(campaign) if plan is None else plan
         self._state: Final[_State] = _State()
         self._stored: Final[dict[str, RunRow]] = {}
+        self._counted: Final[set[str]] = set()
         self._wanted: list[Wanted] = []
         self._queue: Final[deque[Wanted]] = deque()
         self._made: int = 0
@@ -117,13 +118,7 @@ class Runner:
         self._store.points.add(self._campaign.points)
         stored = self._store.runs.all(code_version=self._way.version, wanted=False, brief=True)
         self._stored.update({row.identity: row for row in stored})
-        self._ask()
-        count = {
-            self._campaign.identity_of(Wanted(row.point, row.number), self._way.version): (row.point, row.number)
-            for rows in self._state.known.values()
-            for row in rows
-        }
-        self._store.runs.want(count)
+        self._store.runs.want(self._ask(), only=True)
 
     def run(self, executor: Executor, watch: Watch, stop: Stop) -> Finished:
         """Make what is missing. Raises StoreError and ExecutorError; what was finished before is in the store."""
@@ -163,6 +158,7 @@ class Runner:
         return Progress(len(state.there), len(self._wanted), self._made, elapsed, dict(state.counts))
 
     def _hand_out(self, executor: Executor) -> None:
+        found = False
         while self._queue and executor.free() > 0:
             wanted = self._queue.popleft()
             if (wanted.point, wanted.number) in self._state.there:
@@ -175,9 +171,12 @@ class Runner:
             made = self._stored.get(spec.identity)
             if made is not None:
                 self._state.add(replace(made, point=wanted.point, number=wanted.number))
+                found = True
                 continue
             self._state.in_flight[spec.identity] = wanted
             executor.submit(spec)
+        if found and not self._queue:
+            self._ask_again()
 
     def _take(self, rows: list[RunRow]) -> None:
         """Keep what has finished; ask the plan again when it is about to run out of what it wanted."""
@@ -189,14 +188,25 @@ class Runner:
             self._store.runs.append(row, self._recipe(wanted))
             brief = replace(row, metrics={}, injections=())
             self._stored[row.identity] = brief
+            self._counted.add(row.identity)
             self._state.add(brief)
             self._made += 1
         if rows and len(self._queue) <= len(rows):
-            self._ask()
+            self._ask_again()
 
-    def _ask(self) -> None:
-        """What is wanted now; what of it the store has is known at once, and may make the plan want more."""
+    def _ask_again(self) -> None:
+        """What is wanted now; what is found in the store counts from now on."""
+        found = self._ask()
+        if found:
+            self._store.runs.want(found, only=False)
+
+    def _ask(self) -> dict[str, tuple[Point, int]]:
+        """What is wanted now; what of it the store has is known at once, and may make the plan want more.
+
+        Gives the runs that were found in the store and did not count before, each for the first point that wants it.
+        """
         version, state = self._way.version, self._state
+        counted: dict[str, tuple[Point, int]] = {}
         while True:
             self._wanted = self._plan.wanted(state.known)
             self._store.set_meta({"wanted": str(len(self._wanted))})
@@ -213,8 +223,11 @@ class Runner:
                 else:
                     state.add(replace(row, point=wanted.point, number=wanted.number))
                     found += 1
+                    if row.identity not in self._counted:
+                        self._counted.add(row.identity)
+                        counted[row.identity] = place
             if not found:
-                return
+                return counted
 
     def _recipe(self, wanted: Wanted) -> Recipe:
         stop = self._campaign.stop_early

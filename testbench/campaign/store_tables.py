@@ -79,11 +79,12 @@ class Runs:
             rows = [(run, at, *(getattr(one, name) for name in INJECTION)) for at, one in enumerate(row.injections)]
             connection.executemany(f"INSERT INTO injections VALUES ({marks})", rows)
 
-    def want(self, identities: Mapping[str, tuple[Point, int]]) -> None:
-        """Say which runs count: identity -> its point and number; all others stay, and count no more."""
+    def want(self, identities: Mapping[str, tuple[Point, int]], *, only: bool) -> None:
+        """Say which runs count: identity -> its point and number. only: all others stay, and count no more."""
         with self._database.writing() as connection:
             rows = [(number_in(connection, point), number, name) for name, (point, number) in identities.items()]
-            connection.execute("UPDATE runs SET wanted = 0 WHERE wanted")
+            if only:
+                connection.execute("UPDATE runs SET wanted = 0 WHERE wanted")
             connection.executemany("UPDATE runs SET wanted = 1, point = ?, number = ? WHERE identity = ?", rows)
 
     def forget(self, outcomes: Iterable[Outcome], code_version: str) -> int:

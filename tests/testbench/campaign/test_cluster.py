@@ -134,6 +134,13 @@ def test_worker_that_joined_later_with_other_code_makes_no_row(address: str) -> 
     assert said.version == code_version()
 
 
+@pytest.mark.run
+def test_worker_that_cannot_make_runs_ends_the_campaign_and_makes_no_row(address: str) -> None:
+    """Such a worker is done at once with every run: recorded as crashed, they would be all of the campaign."""
+    with pytest.raises(ExecutorError, match=r"a worker cannot make runs \(AttributeError: .*\); install the same"):
+        rows_of(Cluster(address, f"{MAKERS}:not_there"), [replace(spec("golden"), identity="nowhere")])
+
+
 def test_no_scheduler_at_the_address_is_said_with_its_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("testbench.campaign.cluster.CONNECT_S", 0.5)
     with pytest.raises(ExecutorError, match=r"--cluster tcp://127\.0\.0\.1:9: no scheduler .* 'dask scheduler --host"):

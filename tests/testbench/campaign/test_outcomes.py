@@ -10,6 +10,7 @@ from canopen_exo.bus.error_frame import write_error_frame
 from canopen_exo.bus.frame import FLAG_ERROR, Frame
 from canopen_exo.bus.medium import Transmission
 from canopen_exo.bus.node import ErrorState, PortState
+from canopen_exo.bus.realtime import RECEIVED
 from fi_gateway.activation import Activation
 from hlc.limits import limits_of
 from testbench.campaign.outcomes import first_reaction, outcome_of, phase_at, severity
@@ -73,6 +74,7 @@ def bus_off(state: ErrorState) -> Frame:
     [
         (Frame(EMCY_KNEE, SYNC_LOST), DRIVES_PORT, 1, True),
         (Frame(EMCY_KNEE, ERROR_GONE), DRIVES_PORT, 1, False),
+        (Frame(EMCY_KNEE, SYNC_LOST), RECEIVED, 1, True),  # by the gateway, in real time
         (Frame(EMCY_KNEE, SYNC_LOST), GATEWAYS_PORT, 1, False),  # forged
         (Frame(EMCY_KNEE, SYNC_LOST), 1, 0, False),  # the same on the other side of the gateway
         (Frame(EMCY_KNEE, SYNC_LOST), 7, 1, False),  # a node that a wire fault has added

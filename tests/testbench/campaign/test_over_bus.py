@@ -6,9 +6,11 @@ from pathlib import Path
 
 import pytest
 
+from canopen_exo.bus.node import NEVER
+from fi_gateway.control_socket import Listing
 from fi_gateway.errors import FaultError
 from testbench.campaign import over_bus
-from testbench.campaign.over_bus import OverBus, Rigging, check_scenario
+from testbench.campaign.over_bus import OverBus, Rigging, arm, check_scenario
 from testbench.campaign.records import Outcome, RunRow, RunSpec
 from testbench.errors import BenchError
 from testbench.realtime_run import RealTimeRun
@@ -78,6 +80,20 @@ def test_run_that_proves_nothing_is_made_three_times_and_then_recorded(monkeypat
     [row] = rows_of(OverBus(Rigging()), [spec("knee_freeze_at")])
     assert (row.outcome, row.reason, row.attempts) == (Outcome.INVALID, "golden run: the drives are away", 3)
     assert len(tried) == 3
+
+
+@pytest.mark.parametrize("zero_ns", [NEVER, 5_000_000_000])
+def test_injectors_that_are_armed_after_time_0_make_no_row(monkeypatch: pytest.MonkeyPatch, zero_ns: int) -> None:
+    """A fault that was due before it was armed never comes: the run would look like one that did not activate."""
+    asked: list[tuple[str, ...]] = []
+    monkeypatch.setattr(over_bus, "ask", lambda *words: asked.append(words))
+    monkeypatch.setattr(over_bus, "ask_listing", lambda address: Listing(6_000_000_000, zero_ns, False, [], []))
+    if zero_ns == NEVER:
+        arm("there", ["a", "b"])
+    else:
+        with pytest.raises(BenchError, match="armed after time 0"):
+            arm("there", ["a", "b"])
+    assert asked == [("there", "arm", "a"), ("there", "arm", "b")]
 
 
 def test_words_say_what_the_runs_were_made_on() -> None:

@@ -197,6 +197,21 @@ def test_points_that_are_one_scenario_share_a_run(store: Store, room: int) -> No
     assert not finished.interrupted
 
 
+class TwinsFirst(Plan):
+    """Three points that are one scenario, and another one when all three are known."""
+
+    def wanted(self, known: Known) -> list[Wanted]:
+        first = [Point((("duration", text),)) for text in ("0.05 s", "50 ms", "0.05s")]
+        more = [Point((("duration", "0.3 s"),))] if all(point in known for point in first) else []
+        return [Wanted(point, 0) for point in (*first, *more)]
+
+
+def test_plan_is_asked_again_when_the_last_runs_it_wanted_were_there(store: Store) -> None:
+    """A campaign is over when the plan wants nothing more, not when its queue has run empty."""
+    finished, specs = run(small(), store, Here(room=1), plan=TwinsFirst())
+    assert (finished.progress.done, finished.progress.wanted, len(specs)) == (4, 4, 2)
+
+
 def test_rows_are_the_same_in_whatever_order_runs_finish(store: Store, tmp_path: Path) -> None:
     """A sequential rule on one process and on seven."""
     rule = "runs: {until: {outcome: failure, width: 0.5}, batch: 4, least: 4, most: 40}"
@@ -207,6 +222,19 @@ def test_rows_are_the_same_in_whatever_order_runs_finish(store: Store, tmp_path:
     assert rows_of(store) == rows_of(other)
     assert 8 < len(rows_of(store)) < 80
     other.close()
+
+
+def test_run_made_once_more_leaves_the_later_ones_counted(store: Store) -> None:
+    """`--retry` of a run of the first batch: the batches that were made after it are found again, and count."""
+    campaign = small(("runs: 3", "runs: {until: {outcome: failure, width: 0.5}, batch: 4, least: 4, most: 40}"))
+    run(campaign, store, Here(lambda spec: row_of(spec, Outcome.CRASHED if spec.seed == 5 else None)))
+    before = [(row.point, row.number) for row in store.runs.all()]
+    assert store.runs.forget((Outcome.CRASHED,), WAY.version) == 2
+    finished, again = run(campaign, store)
+    assert len(again) == 2
+    assert len(store.runs.all()) == finished.progress.done == finished.progress.wanted
+    assert {(row.point, row.number) for row in store.runs.all()} <= set(before)
+    assert len(store.runs.all()) > 8
 
 
 def test_failing_executor_keeps_what_was_made(store: Store) -> None:

@@ -110,7 +110,7 @@ def test_runs_that_are_not_wanted_stay_and_do_not_count(store: Store) -> None:
     for row in rows:
         store.runs.append(row, RECIPE)
     elsewhere = Point((("axis", "2"),))
-    store.runs.want({rows[1].identity: (elsewhere, 7)})
+    store.runs.want({rows[1].identity: (elsewhere, 7)}, only=True)
     assert store.runs.all() == [dataclasses.replace(rows[1], point=elsewhere, number=7)]
     assert len(store.runs.all(wanted=False)) == 3
     assert store.runs.others() == {"1": 2}
