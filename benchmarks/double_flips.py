@@ -3,7 +3,8 @@
 CRC-15 finds all double errors in the bits it covers, but a flip can make or unmake a stuff bit: then the bits between
 the two flips arrive shifted by one, which is an error of many bits. All pairs of bits of random 8-byte frames are tried
 (SOF to the last CRC bit), all pairs of a frame at once. What is found is confirmed by the bit engine: the sender is
-acknowledged, the receiver has other data. Prints frames and pairs, and their share of all pairs that were tried.
+acknowledged, the receiver has other data. Prints frames and pairs, and their share of all pairs that were tried with
+its 95 % interval (Clopper and Pearson; pairs of one frame are taken for independent).
 
     python -m benchmarks.double_flips [--seed N] [--frames N]
 """
@@ -14,6 +15,7 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
+from scipy import stats
 
 from canopen_exo.bus.bit_engine import run, split
 from canopen_exo.bus.bit_stream import BASE_HEADER, CRC_BITS, STUFF_AFTER, wire_bits
@@ -96,7 +98,8 @@ def main() -> int:
         hits += len(found)
         for pair in found:
             print(f"{frame!r} bits {pair[0]} and {pair[1]}: accepted as {wrong_frame(frame, pair)!r}")
-    print(f"{hits} of {tried} pairs ({hits / tried:.2g})")
+    low, high = stats.binomtest(hits, tried).proportion_ci(0.95, method="exact")
+    print(f"{hits} of {tried} pairs: {hits / tried:.2g} ({low:.2g} to {high:.2g})")
     return 0
 
 

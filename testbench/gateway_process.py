@@ -40,6 +40,7 @@ from testbench.errors import BenchError
 from testbench.process import DONE, INVALID, ProcessOptions, Session, say, session
 
 if TYPE_CHECKING:
+    from fi_gateway.addition import Additions
     from testbench.fault_file import FaultFile
 
 _DONE: Final = {
@@ -104,8 +105,7 @@ def gateway_main(
                 if server.is_exposed:
                     say("gateway", f"warning: {server.address} can be reached from other machines")
             say("gateway", f"between {buses[0]} (controller) and {buses[1]} (drives); {_injectors_text(gateway)}")
-            counts_cycles = given.faults and any(one.event.counts_cycles() for one in faults.injectors.values())
-            is_valid = _serve(process, control, server, server is not None or given.frames is not None, counts_cycles)
+            is_valid = _serve(process, control, server, server is not None or given.frames is not None, additions)
         gateway.finish(process.loop.now())
         if options.part is not None:
             _leave_part(options, process, control)
@@ -194,11 +194,11 @@ def active_faults(address: str) -> list[str]:
 
 
 def _serve(
-    process: Session, control: LiveControl, server: ControlServer | None, can_resume: bool, counts_cycles: bool
+    process: Session, control: LiveControl, server: ControlServer | None, can_resume: bool, additions: "Additions"
 ) -> bool:
     """Until told to end; False when what was injected counted cycles of the wrong length.
 
-    can_resume: there is live control to resume injection with; counts_cycles: an injector does.
+    can_resume: there is live control to resume injection with; additions: what the injectors were made from.
     """
     interrupted = False
     is_valid = True
@@ -207,7 +207,7 @@ def _serve(
 
     def judge() -> None:
         nonlocal is_valid
-        other = _other_rate(control, counts_cycles) if is_valid else ""
+        other = _other_rate(control, additions) if is_valid else ""
         if other:
             is_valid = False
             say("gateway", f"error: {other}")
@@ -231,12 +231,13 @@ def _serve(
     return is_valid
 
 
-def _other_rate(control: LiveControl, counts_cycles: bool) -> str:
+def _other_rate(control: LiveControl, additions: "Additions") -> str:
     """Why the faults act at wrong times, "" when they do not: by the rate of SYNC, where anything hangs on it."""
     gateway = control.gateway
     by_hand = any(row.what == START and not row.refused for row in control.rows)
-    by_cycles = gateway.time_zero != NEVER and not by_hand
-    return gateway.cadence.words() if gateway.injectors and (counts_cycles or by_cycles) else ""
+    by_status = gateway.time_zero != NEVER and not by_hand
+    by_cycles = any(spec.event.counts_cycles() for spec in additions.specs.values())
+    return gateway.cadence.words() if gateway.injectors and (by_status or by_cycles) else ""
 
 
 def _leave_part(options: ProcessOptions, process: Session, control: LiveControl) -> None:

@@ -9,6 +9,7 @@ process that needs it.
 
 import ctypes
 import os
+import select
 import shutil
 import signal
 import sys
@@ -41,6 +42,9 @@ ENDED_EARLY: Final = 4
 
 LEAVE_NS: Final = SECOND
 """Most that the controller may take to disable the drives once told to end."""
+
+_READ_OUT_NS: Final = SECOND // 2
+"""Most that a process may take at its end for what has come by then."""
 
 _LOOK_NS: Final = 50 * MS
 """How often a supervised process looks whether its supervisor is there."""
@@ -137,7 +141,16 @@ class Session:
             return until(now)
 
         self.loop.run(over)
+        if self.loop.trace is not None:
+            self._read_out()
         self._warn()
+
+    def _read_out(self) -> None:
+        """Serve what has come already: a process that was held up would leave frames unread, and they count as lost."""
+        limit = self.loop.now() + _READ_OUT_NS
+        readers = [fd for fd in (channel.fileno() for channel in self._channels) if fd >= 0]
+        while readers and select.select(readers, [], [], 0)[0] and self.loop.now() < limit:
+            self.loop.poll()
 
     def losses(self) -> dict[str, int]:
         """What was lost so far, in words -> frames; empty when nothing was."""

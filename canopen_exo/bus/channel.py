@@ -17,8 +17,7 @@ from canopen_exo.bus.node import MS, NEVER, SECOND, PortState
 
 _COMPARISONS: Final = 5
 _COMPARED_WITHIN_NS: Final = 5_000
-"""A process that is interrupted between two clocks compares them again, four times at most; the closest counts. Where
-reading a clock takes longer than this, twice the closest so far will do."""
+"""A process that is interrupted between two clocks compares them again, four times at most; the closest counts."""
 
 _COMPARED_FOR_NS: Final = MS
 """How long a comparison holds: a wall clock that is being slewed drifts by 0.5 us in it (500 ppm, adjtimex(2))."""
@@ -114,7 +113,8 @@ class StampClock:
 
     Both clocks are compared anew for every batch, at most once a millisecond, so a corrected wall clock does no harm: a
     stamp lies between the one before it and now, whatever the wall clock did meanwhile. `begin` comes after the
-    reading: what arrives between the two, while the process is held up, would count as earlier than it was sent.
+    reading: what arrives between the two, while the process is held up, would count as earlier than it was sent. The
+    difference found holds until a comparison contradicts it, so one that was interrupted does not spoil it.
     now: of the last `begin`; offset: what to take from a stamp, ns; last: the stamp given last.
     """
 
@@ -124,7 +124,6 @@ class StampClock:
         self.last: int = -NEVER
         self._epoch_ns: int = 0
         self._compare_at: int = -NEVER
-        self._closest_ns: int = 0
 
     def begin(self, epoch_ns: int) -> int:
         """Compare the clocks when it is time to; returns now on the loop's clock [ns]."""
@@ -135,19 +134,22 @@ class StampClock:
         return self.now
 
     def _compare(self, epoch_ns: int) -> int:
-        """Find the difference of the clocks; returns CLOCK_MONOTONIC."""
+        """Find the difference of the clocks, unless the known one will do; returns CLOCK_MONOTONIC."""
+        is_known = epoch_ns == self._epoch_ns and self._compare_at != -NEVER
         tightest = NEVER
         for _ in range(_COMPARISONS):
             before = time.monotonic_ns()
             wall = time.time_ns()
             after = time.monotonic_ns()
-            if after - before < tightest:
-                tightest = after - before
-                self.offset = wall - (before + after) // 2 + epoch_ns
-            if tightest < _COMPARED_WITHIN_NS or tightest <= 2 * self._closest_ns:
+            least, most = wall - after + epoch_ns, wall - before + epoch_ns
+            if is_known and least <= self.offset <= most:
                 break
-        if self._closest_ns == 0 or tightest < self._closest_ns:
-            self._closest_ns = tightest
+            is_known = False
+            if most - least < tightest:
+                tightest = most - least
+                self.offset = (least + most) // 2
+            if tightest < _COMPARED_WITHIN_NS:
+                break
         self._epoch_ns = epoch_ns
         self._compare_at = after + _COMPARED_FOR_NS
         return after

@@ -69,7 +69,7 @@ def _run(rows: Sequence[RunRow], meta: Meta) -> str:
     """How it was run, in a sentence; nothing that differs from machine to machine."""
     mute = sum(row.outcome in NO_STATEMENT for row in rows)
     seeds = sorted({row.seed for row in rows})
-    span = f"seeds {seeds[0]} to {seeds[-1]}" if seeds else "no seeds"
+    span = f"seeds {seeds[0]} to {seeds[-1]}" if len(seeds) > 1 else f"seed {seeds[0]}" if seeds else "no seed"
     missing = f", {meta.wanted - len(rows)} still missing" if meta.wanted > len(rows) else ""
     return f"{len(rows)} runs{missing}, {meta.asked}, {span}; {mute} without a statement.\n"
 

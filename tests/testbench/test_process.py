@@ -155,6 +155,50 @@ def test_gateway_first_stops_injecting_and_ends_with_the_second_interrupt(
     assert [channel.name for channel in channels] == ["virtual:controller", "virtual:drive"]
 
 
+class FullChannel(DeadChannel):
+    """Like an interface in whose buffer frames wait, of which one is read at a time."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name)
+        self.unread = [Frame(0x181, bytes((number,))) for number in range(3)] if name.endswith("drive") else []
+        self._ours, self._theirs = socket.socketpair()
+        self._theirs.send(bytes(len(self.unread)))
+
+    def fileno(self) -> int:
+        return self._ours.fileno()
+
+    def receive(self) -> list[Arrival]:
+        self.poll_at = NEVER
+        if not self.unread:
+            return []
+        self._ours.recv(1)
+        return [Arrival(0, self.unread.pop(0), None)]
+
+    def close(self) -> None:
+        super().close()
+        self._ours.close()
+        self._theirs.close()
+
+
+def test_what_has_come_before_the_end_is_served(
+    scenario: Scenario, monkeypatch: pytest.MonkeyPatch, signalled: Iterator[list[int]], tmp_path: Path
+) -> None:
+    """A gateway that was held up when it is told to end loses nothing of what came before."""
+    opened: list[FullChannel] = []
+
+    def open_full(bus: BusName) -> Channel:
+        opened.append(FullChannel(str(bus)))
+        return opened[-1]
+
+    monkeypatch.setattr(process, "open_bus", open_full)
+    next(signalled).append(signal.SIGTERM)
+    part = tmp_path / "gateway.npz"
+    buses = (parse_bus("virtual:controller"), parse_bus("virtual:drive"))
+    assert gateway_main(faults_of(scenario), buses, ProcessOptions(part=part), GatewayOptions()) == 0
+    assert [frame.data for frame in opened[0].sent] == [b"\0", b"\1", b"\2"]
+    assert len(read_gateway(part).rows) == 6
+
+
 @pytest.mark.parametrize("address", ["127.0.0.1:TAKEN", "/no/such/folder/control"])
 def test_gateway_that_cannot_listen_is_told_in_one_line(
     channels: list[DeadChannel], address: str, capsys: pytest.CaptureFixture[str]
@@ -332,7 +376,7 @@ def test_gateway_says_by_direction_what_was_lost_and_when_an_interface_was_off(
     buses = (parse_bus("virtual:controller"), parse_bus("virtual:drive"))
 
     def serve_once(
-        served: process.Session, control: object, server: object, can_resume: bool, counts_cycles: bool
+        served: process.Session, control: object, server: object, can_resume: bool, additions: object
     ) -> bool:
         turns = iter((False, True))
         served.run(lambda now: next(turns))
