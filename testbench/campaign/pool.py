@@ -2,7 +2,9 @@
 
 A process that dies or takes longer than a run may is replaced, and its run is tried again, twice at most; then its row
 says crashed or hang. An exception is a defect and comes again: it is recorded at once, and the process replaced, as
-nobody knows what the exception left behind. Processes are started afresh (spawn), never forked: the same everywhere.
+nobody knows what the exception left behind. A new process whose code is not this one's, because somebody has changed it
+meanwhile, is an error: its rows would be of another program. Processes are started afresh (spawn), never forked: the
+same everywhere.
 """
 
 import multiprocessing
@@ -19,6 +21,7 @@ from multiprocessing.context import SpawnProcess
 from typing import Final, final
 
 from testbench.campaign.executor import ATTEMPTS, Executor, ExecutorError, given_up
+from testbench.campaign.identity import code_version
 from testbench.campaign.records import Outcome, RunRow, RunSpec
 from testbench.campaign.worker import DEFAULT, Failed, worker_main
 from testbench.errors import BenchError
@@ -101,6 +104,7 @@ class Pool(Executor):
             raise BenchError(f"jobs: {jobs} given; allowed from 1 up")
         self._jobs: Final[int] = jobs
         self._maker: Final[str] = maker
+        self._version: Final[str] = code_version()
         self._workers: Final[list[_Worker]] = []
         self._waiting: Final[deque[_Task]] = deque()
         self._finished: Final[list[RunRow]] = []
@@ -181,6 +185,11 @@ class Pool(Executor):
     def _heard(self, worker: _Worker, said: object) -> None:
         task, worker.task = worker.task, None
         if task is None:
+            if said != self._version:
+                raise ExecutorError(
+                    f"the program was changed while it ran: a new process has code {said}, this one {self._version}; "
+                    "what was finished is in the store; start again, which makes all runs anew"
+                )
             worker.is_ready = True
             self._failed_starts = 0
         elif isinstance(said, RunRow):

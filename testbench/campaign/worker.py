@@ -1,8 +1,8 @@
 """A process that makes one run after another, for whoever started it, and ends with him.
 
-What it is told comes over a pipe: a RunSpec, or None to end; what it answers is "ready" once, and then a row, or the
-text of an exception, for every RunSpec. It ignores Ctrl-C, which is for the one who started it. When that one is gone,
-however, it ends at once, in the middle of a run: nobody would read the row.
+What it is told comes over a pipe: a RunSpec, or None to end; what it answers is its code version once, when it is
+ready, and then a row, or the text of an exception, for every RunSpec. It ignores Ctrl-C, which is for the one who
+started it. When that one is gone, however, it ends at once, in the middle of a run: nobody would read the row.
 """
 
 import importlib
@@ -17,6 +17,7 @@ from multiprocessing import parent_process
 from multiprocessing.connection import Connection, wait
 from typing import Final
 
+from testbench.campaign.identity import code_version
 from testbench.campaign.records import RunRow, RunSpec
 
 MakeRun = Callable[[RunSpec], RunRow]
@@ -71,7 +72,7 @@ def worker_main(pipe: Connection, name: str) -> None:
     threading.Thread(target=_end_with_parent, daemon=True).start()
     try:
         make = maker_named(name)
-        pipe.send("ready")
+        pipe.send(code_version())
         while (spec := pipe.recv()) is not None:
             pipe.send(made_or_failed(make, spec))
     except (EOFError, BrokenPipeError, ConnectionResetError):

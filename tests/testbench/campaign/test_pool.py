@@ -95,6 +95,15 @@ def test_processes_that_never_get_ready_are_an_error(capfd: pytest.CaptureFixtur
             all_of(executor, [spec(1)])
 
 
+def test_program_that_was_changed_meanwhile_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A process that is started later reads the changed files: its rows would have the version of the old ones."""
+    monkeypatch.setattr("testbench.campaign.pool.code_version", lambda: "0.1.0+before")
+    with pool("quick") as executor:
+        executor.submit(spec(0))
+        with pytest.raises(ExecutorError, match=r"changed while it ran: .* has code .*, this one 0\.1\.0\+before"):
+            all_of(executor, [spec(1)])
+
+
 def test_libraries_are_told_to_use_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
     """The processes are the parallelism."""
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
