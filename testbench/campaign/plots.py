@@ -156,7 +156,7 @@ def _of_metric(panel: Panel) -> tuple["DrawnFigure", str] | None:
     labels = (panel.x_label, quantity(panel.wanted.y).label)
     columns = [_column(one) for one in described]
     figure = metric_figure(dots, columns, _curve(fits), panel.wanted.paper, labels)
-    return figure, f"{len(dots)} runs, each a dot.{_fit_words(fits)}{_cut_words(panel)}"
+    return figure, f"{len(dots)} runs, each a dot.{_fit_words(fits)}{f' {cut}.' if (cut := _cut_words(panel)) else ''}"
 
 
 def _dots(panel: Panel) -> list[tuple[float, float]]:
@@ -265,7 +265,8 @@ def _values_table(panel: Panel, described: Sequence[Described]) -> Table:
         ]
         body.append((*cells, *([_beside(paper.get(one.x), one.mean)] if paper else [])))
     unit = quantity(panel.wanted.y).unit
-    caption = f"{panel_title(panel)}{f', in {unit}' if unit else ''}"
+    cut = _cut_words(panel)
+    caption = f"{panel_title(panel)}{f', in {unit}' if unit else ''}{f' ({cut})' if cut else ''}"
     return Table(caption, (*heads, *(["the paper"] if paper else [])), tuple(body), frozenset())
 
 
@@ -300,7 +301,7 @@ def _cut_words(panel: Panel) -> str:
     if not early:
         return ""
     subject, their = ("1 run", "its") if early == 1 else (f"{early} runs", "their")
-    return f" {subject} ended early: {their} numbers cover a part of the motion."
+    return f"{subject} ended early: {their} numbers cover a part of the motion"
 
 
 def _fit_words(fits: Fits | None) -> str:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from testbench.campaign.markdown import table_of
 from testbench.campaign.meta import Meta
 from testbench.campaign.records import Outcome, RunRow
 from testbench.campaign.report import html_text, write_report
@@ -170,6 +171,8 @@ def test_runs_cut_short_are_told_under_their_numbers() -> None:
     cut = row(points[0], 2, metrics={RMSE: 3.0}, ended_s=2.5)
     about = meta([axis("duration", "0.1 s")], points, [figure()])
     assert "1 run ended early: its numbers cover a part of the motion." in words([*rows, cut], about)
+    table = table_of([*rows, cut], about, "values 1").splitlines()[0]
+    assert table.endswith("in rad (1 run ended early: its numbers cover a part of the motion):")
     assert "ended early" not in words(rows, about)
 
 
