@@ -3,9 +3,9 @@
 The campaign stays here: plan, store and report are the client's, workers get a RunSpec and give a row. Every worker is
 asked for its code version before it gets anything, and again with every run, as workers come and go: one with other
 code ends the campaign with an error, because its rows would be of another program. A worker makes one run at a time, in
-a thread of its own process. When it dies the scheduler gives its run to another one,
-`distributed.scheduler.allowed-failures` times (3 by default); then the row says crashed, or hang when the worker ended
-itself because the run took longer than it may. The address is the user's: nothing here listens.
+a thread of its own process. When it dies the scheduler gives its run to another one; that is tried again
+`distributed.scheduler.allowed-failures` times (3 by default, so four tries in all); then the row says crashed, or hang
+when the worker ended itself because the run took longer than it may. The address is the user's: nothing here listens.
 """
 
 import os
