@@ -102,7 +102,7 @@ paper: $(READY) ## the campaigns of docs/paper.md, and its tables from them: an 
 	run campaigns/small_faults.yaml --out $$to/small_faults.sqlite; \
 	run campaigns/small_faults.yaml --out $$to/small_faults-pins.sqlite --set rig.stops=on; \
 	run campaigns/bit_flips.yaml --out $$to/bit_flips.sqlite
-	$(BIN)/python -m testbench.campaign.markdown docs/paper.md
+	$(BIN)/python -m testbench.campaign.report.markdown docs/paper.md
 
 lock: ## for maintainers: newest versions allowed by pyproject.toml into requirements.lock, for all platforms
 	@rm -rf build/lock && $(PYTHON) -m venv build/lock && build/lock/bin/python -m pip install --quiet uv

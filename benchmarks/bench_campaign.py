@@ -18,8 +18,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-from testbench.campaign.execute import Workshop, make_run
-from testbench.campaign.pool import Pool
+from testbench.campaign.making.execute import Workshop, make_run
+from testbench.campaign.making.pool import Pool
 from testbench.campaign.records import Point, RunRow, RunSpec, Wanted
 from testbench.run import rig_params, run_scenario
 from testbench.scenario import load_scenario, parse_scenario

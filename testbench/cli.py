@@ -217,7 +217,7 @@ def _real_time_buses(options: argparse.Namespace) -> tuple[str, str] | None:
 def _check(options: argparse.Namespace) -> int:
     """Validate a scenario, a campaign, or a file of faults for the gateway, and say in words what it will do."""
     from fi_gateway.marked_yaml import FileErrors
-    from testbench.campaign.schema import is_campaign_file
+    from testbench.campaign.file.schema import is_campaign_file
     from testbench.cli_campaign import check_campaign
     from testbench.fault_file import FaultFile, describe_faults, load_any
     from testbench.scenario import describe

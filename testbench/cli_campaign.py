@@ -18,12 +18,12 @@ from testbench.cli_rig import HUB_ADDRESS, INVALID, PASS, USAGE, Verbs, add_rig_
 from testbench.errors import BenchError
 
 if TYPE_CHECKING:
-    from testbench.campaign.executor import Executor
-    from testbench.campaign.over_bus import Rigging
+    from testbench.campaign.file.schema import Campaign
+    from testbench.campaign.making.executor import Executor
+    from testbench.campaign.making.over_bus import Rigging
     from testbench.campaign.records import RunRow
     from testbench.campaign.runner import Finished
-    from testbench.campaign.schema import Campaign
-    from testbench.campaign.store import Store
+    from testbench.campaign.store.store import Store
     from testbench.process import Orders
 
 INTERRUPTED: Final = 130
@@ -85,7 +85,7 @@ def add_campaign_verbs(verbs: Verbs, show: Callable[[str], None]) -> None:
 
 def check_campaign(path: Path, overrides: list[str], seed: str | None, show: Callable[[str], None]) -> int:
     """`exo-hil check` for a campaign; raises FileErrors."""
-    from testbench.campaign.schema import load_campaign
+    from testbench.campaign.file.schema import load_campaign
     from testbench.campaign.words import describe_campaign
 
     if seed is not None:
@@ -133,13 +133,13 @@ def _run(options: argparse.Namespace, show: Callable[[str], None]) -> int:
     hub or on the buses named, the gateway armed over live control for each run. Started again, it goes on where it was,
     whatever ended it. Ctrl-C once: nothing more is begun, runs in flight get a moment; twice: they are dropped.
     """
-    from testbench.campaign.archive import remember
-    from testbench.campaign.identity import code_version
+    from testbench.campaign.file.schema import load_campaign
+    from testbench.campaign.making.identity import code_version
     from testbench.campaign.progress import shown
     from testbench.campaign.records import NO_STATEMENT, Outcome
     from testbench.campaign.runner import Runner, Way
-    from testbench.campaign.schema import load_campaign
-    from testbench.campaign.store import open_store
+    from testbench.campaign.store.archive import remember
+    from testbench.campaign.store.store import open_store
     from testbench.process import Orders
 
     campaign = load_campaign(options.campaign, options.overrides, options.runs)
@@ -182,7 +182,7 @@ def _rigging(options: argparse.Namespace) -> "Rigging | None":
     others = [name for name in ("cluster", "jobs") if getattr(options, name)]
     if others:
         raise BenchError(f"--{others[0]}: runs against the clock are made one after another, here; leave it out")
-    from testbench.campaign.over_bus import Rigging
+    from testbench.campaign.making.over_bus import Rigging
 
     without = frozenset(options.without)
     listen = options.listen or (HUB_ADDRESS if without else "127.0.0.1:0")
@@ -194,20 +194,20 @@ def _executor(
 ) -> "Executor":
     """Where the runs are made. Raises BenchError and FaultError for runs that cannot be made there."""
     if rigging is not None:
-        from testbench.campaign.over_bus import OverBus, check_scenario
+        from testbench.campaign.making.over_bus import OverBus, check_scenario
 
         for point in campaign.points:
             check_scenario(campaign.settings.scenario(point), rigging)
         return OverBus(rigging)
     if options.cluster is not None:
         try:
-            from testbench.campaign.cluster import Cluster
+            from testbench.campaign.making.cluster import Cluster
         except ModuleNotFoundError as error:
             raise BenchError(
                 f"--cluster: {error.name} is not installed; it comes with the extra: pip install 'exo-hil[cluster]'"
             ) from error
         return Cluster(options.cluster)
-    from testbench.campaign.pool import Pool
+    from testbench.campaign.making.pool import Pool
 
     return Pool(jobs)
 
@@ -291,7 +291,7 @@ def _counts(store: "Store", rows: "list[RunRow]") -> dict[str, object]:
 def _points(store: "Store", rows: "list[RunRow]") -> list[dict[str, object]]:
     """A point each: parameters as written, runs, outcomes, share of failures with its 95 % Wilson interval."""
     from testbench.campaign.records import Outcome, Point
-    from testbench.campaign.statistics import tally, wilson
+    from testbench.campaign.statistics.shares import tally, wilson
 
     found: dict[Point, list[Outcome]] = {}
     for row in rows:
@@ -318,7 +318,7 @@ def _points(store: "Store", rows: "list[RunRow]") -> list[dict[str, object]]:
 
 def _status(options: argparse.Namespace, show: Callable[[str], None]) -> int:
     """How far a campaign is: counts, rate, and the runs that make no statement with their reasons; nothing is run."""
-    from testbench.campaign.store import open_store
+    from testbench.campaign.store.store import open_store
     from testbench.campaign.words import counts_text, time_text
 
     store = open_store(options.store)
@@ -346,7 +346,7 @@ def _status(options: argparse.Namespace, show: Callable[[str], None]) -> int:
 
 def _report(options: argparse.Namespace, show: Callable[[str], None]) -> int:
     """Write the report of a store: one HTML file that needs nothing else, and a JUnit file; also of a part of it."""
-    from testbench.campaign.store import open_store
+    from testbench.campaign.store.store import open_store
 
     store = open_store(options.store)
     try:
@@ -357,8 +357,8 @@ def _report(options: argparse.Namespace, show: Callable[[str], None]) -> int:
 
 
 def _write_report(store: "Store", html: Path | None, junit: Path | None) -> None:
-    from testbench.campaign.archive import contents
-    from testbench.campaign.report import write_report
+    from testbench.campaign.report.page import write_report
+    from testbench.campaign.store.archive import contents
 
     html = html or store.path.with_suffix(".html")
     junit = junit or store.path.with_suffix(".xml")
@@ -374,7 +374,7 @@ def _write_report(store: "Store", html: Path | None, junit: Path | None) -> None
 def _replay(options: argparse.Namespace, show: Callable[[str], None]) -> int:
     """Make one run again with its full result folder, as `exo-hil run` writes it, and say whether it is the same."""
     from testbench.campaign.again import make_again
-    from testbench.campaign.store import open_store
+    from testbench.campaign.store.store import open_store
 
     store = open_store(options.store)
     try:
@@ -390,8 +390,8 @@ def _replay(options: argparse.Namespace, show: Callable[[str], None]) -> int:
 
 def _export(options: argparse.Namespace, show: Callable[[str], None]) -> int:
     """Write the runs as one flat table: axes as written and in SI, outcome, numbers, metrics."""
-    from testbench.campaign.export import injection_table, run_table, write_csv, write_parquet
-    from testbench.campaign.store import open_store
+    from testbench.campaign.store.export import injection_table, run_table, write_csv, write_parquet
+    from testbench.campaign.store.store import open_store
 
     if options.csv is None and options.parquet is None:
         raise BenchError("export: where to? give --csv FILE, --parquet FILE, or both")

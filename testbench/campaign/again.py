@@ -4,10 +4,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from testbench.campaign.execute import Workshop, make_run
-from testbench.campaign.identity import code_version, with_seed
+from testbench.campaign.making.execute import Workshop, make_run
+from testbench.campaign.making.identity import code_version, with_seed
 from testbench.campaign.records import IN_REAL_TIME, NO_STATEMENT, RunRow, RunSpec, Wanted
-from testbench.campaign.store import Store
+from testbench.campaign.store.store import Store
 from testbench.errors import BenchError
 from testbench.store import check_folder
 

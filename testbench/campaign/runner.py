@@ -13,11 +13,11 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from typing import Final, final
 
-from testbench.campaign.executor import Executor
-from testbench.campaign.plan_of import plan_of
+from testbench.campaign.file.schema import Campaign
+from testbench.campaign.making.executor import Executor
+from testbench.campaign.plans.plan_of import plan_of
 from testbench.campaign.records import Outcome, Plan, Point, RunRow, Wanted
-from testbench.campaign.schema import Campaign
-from testbench.campaign.store import Invocation, Recipe, Store
+from testbench.campaign.store.store import Invocation, Recipe, Store
 from testbench.errors import BenchError
 
 LOOK_S: Final = 0.2

@@ -3,12 +3,12 @@
 from collections.abc import Mapping, Sequence
 from typing import Final
 
-from testbench.campaign.axes import Axis
+from testbench.campaign.file.axes import Axis
+from testbench.campaign.file.rules import FixedRuns, Rule, Until
+from testbench.campaign.file.schema import Campaign
+from testbench.campaign.plans.search import CriticalSearch
 from testbench.campaign.records import NO_STATEMENT, Outcome, Point, RunRow
-from testbench.campaign.rules import FixedRuns, Rule, Until
-from testbench.campaign.schema import Campaign
-from testbench.campaign.search import CriticalSearch
-from testbench.campaign.statistics import tally, wilson
+from testbench.campaign.statistics.shares import tally, wilson
 
 SHOWN: Final = 40
 """Points of which a summary on the terminal shows a line; the report has them all."""

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from testbench.campaign.records import Outcome, RunRow
-from testbench.campaign.store import open_store
+from testbench.campaign.store.store import open_store
 from testbench.cli import INVALID, PASS, main
 from tests.parity.patience import BUSY, is_lateness
 from tests.parity.walks import Bench

@@ -247,6 +247,7 @@ OUTCOMES = {
     "bit_flip": ("pass", "masked"),  # with this seed bit 7: 6 mrad in one cycle
     "knee_freeze_at": ("pass", "error"),  # loading response: the knee hardly moves, the sensor's return jumps
     "knee_freeze": ("fail", "failure"),  # swing: the knee is driven on, past the end of its range of travel
+    "knee_freezes": ("fail", "failure"),  # three freezes, 1.27 strides apart: one of them meets the swing
     "fault_chain": ("pass", "masked"),  # 0.1 s frozen moves no joint past a limit; one heartbeat of three may be missed
 }
 

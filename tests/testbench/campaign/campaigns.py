@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from testbench.campaign.schema import Campaign, parse_campaign
+from testbench.campaign.file.schema import Campaign, parse_campaign
 
 SCENARIO = """\
   name: short

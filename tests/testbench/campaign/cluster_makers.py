@@ -4,8 +4,8 @@ import os
 import threading
 from pathlib import Path
 
+from testbench.campaign.making.worker import MakeRun
 from testbench.campaign.records import Outcome, RunRow, RunSpec
-from testbench.campaign.worker import MakeRun
 
 
 def row_of(spec: RunSpec) -> RunRow:

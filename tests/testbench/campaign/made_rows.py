@@ -3,10 +3,10 @@
 import hashlib
 from collections.abc import Mapping, Sequence
 
-from testbench.campaign.axes import Axis
-from testbench.campaign.meta import Meta
+from testbench.campaign.file.axes import Axis
+from testbench.campaign.file.rules import Figure, FixedRuns, Rule
 from testbench.campaign.records import FAILURES, Outcome, Point, RunRow
-from testbench.campaign.rules import Figure, FixedRuns, Rule
+from testbench.campaign.report.meta import Meta
 
 RMSE = "right_knee.rmse_position_rad"
 ALL = (float("-inf"), float("inf"))

@@ -12,8 +12,8 @@ from decimal import Decimal
 from multiprocessing import Pool
 from statistics import median
 
-from testbench.campaign.critical import Answer, CriticalResult
-from testbench.campaign.search import METHODS, CriticalSearch
+from testbench.campaign.plans.critical import Answer, CriticalResult
+from testbench.campaign.plans.search import METHODS, CriticalSearch
 from tests.testbench.campaign.worlds import Logistic, searched
 
 AXIS = ("duration", Decimal("0.05"), Decimal("3"), Decimal("0.01"), "s")

@@ -5,9 +5,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fi_gateway.marked_yaml import parse
-from testbench.campaign.axes import Axis, grid, read_axis, size
-from testbench.campaign.filters import parse_filter
-from testbench.campaign.values import number_of, text_of, with_unit
+from testbench.campaign.file.axes import Axis, grid, read_axis, size
+from testbench.campaign.file.filters import parse_filter
+from testbench.campaign.file.values import number_of, text_of, with_unit
 
 
 def axis(text: str, name: str = "x", seed: int = 1) -> Axis:

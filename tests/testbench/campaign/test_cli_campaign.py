@@ -13,9 +13,9 @@ from pathlib import Path
 
 import pytest
 
-import testbench.campaign.pool
+import testbench.campaign.making.pool
 from testbench.campaign.records import Outcome, RunRow
-from testbench.campaign.store import open_store
+from testbench.campaign.store.store import open_store
 from testbench.cli import main
 from tests.testbench.campaign.campaigns import written
 from tests.testbench.campaign.workers import HERE
@@ -23,7 +23,7 @@ from tests.testbench.campaign.workers import HERE
 # The program with workers of a test, and with the interrupt key at work also in the background of a shell.
 PROGRAM = """
 import signal, sys
-import testbench.campaign.pool as pool
+import testbench.campaign.making.pool as pool
 from testbench.cli import main
 if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -93,7 +93,7 @@ def is_alive(process: int) -> bool:
 @pytest.fixture
 def fake(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
     """Have this process's pools make runs by a function of tests.testbench.campaign.workers."""
-    made = testbench.campaign.pool.Pool.__init__
+    made = testbench.campaign.making.pool.Pool.__init__
     return lambda maker: monkeypatch.setattr(made, "__defaults__", (f"{HERE}:{maker}",))
 
 

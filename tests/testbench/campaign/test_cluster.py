@@ -13,10 +13,10 @@ from pathlib import Path
 import distributed
 import pytest
 
-from testbench.campaign.cluster import Cluster, OtherCode, complaints, make_there
-from testbench.campaign.execute import Workshop, make_run
-from testbench.campaign.executor import Executor, ExecutorError
-from testbench.campaign.identity import code_version
+from testbench.campaign.making.cluster import Cluster, OtherCode, complaints, make_there
+from testbench.campaign.making.execute import Workshop, make_run
+from testbench.campaign.making.executor import Executor, ExecutorError
+from testbench.campaign.making.identity import code_version
 from testbench.campaign.records import Outcome, RunRow, RunSpec
 from tests.testbench.campaign.specs import spec
 
@@ -142,14 +142,14 @@ def test_worker_that_cannot_make_runs_ends_the_campaign_and_makes_no_row(address
 
 
 def test_no_scheduler_at_the_address_is_said_with_its_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("testbench.campaign.cluster.CONNECT_S", 0.5)
+    monkeypatch.setattr("testbench.campaign.making.cluster.CONNECT_S", 0.5)
     with pytest.raises(ExecutorError, match=r"--cluster tcp://127\.0\.0\.1:9: no scheduler .* 'dask scheduler --host"):
         Cluster("tcp://127.0.0.1:9")
 
 
 @pytest.mark.run
 def test_cluster_without_workers_is_said_with_its_remedy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("testbench.campaign.cluster.WORKERS_S", 0.2)
+    monkeypatch.setattr("testbench.campaign.making.cluster.WORKERS_S", 0.2)
     with (
         dask_cluster(tmp_path, 0) as empty,
         pytest.raises(ExecutorError, match=r"no worker there for 0\.2 s; .* dask worker tcp://127"),

@@ -4,10 +4,10 @@ from collections.abc import Callable
 
 import pytest
 
-from testbench.campaign.combinations import CombinationPlan, Verdict
+from testbench.campaign.plans.combinations import CombinationPlan, Verdict
+from testbench.campaign.plans.search import CombinationSearch
 from testbench.campaign.records import Outcome, Point, RunRow, Wanted
-from testbench.campaign.search import CombinationSearch
-from testbench.campaign.statistics import Tally, clopper_pearson
+from testbench.campaign.statistics.shares import Tally, clopper_pearson
 from tests.testbench.campaign.worlds import play, row
 
 FAIL, PASS, LOST = Outcome.FAILURE_SILENT, Outcome.MASKED, Outcome.INVALID

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from testbench.campaign.critical import Answer, CriticalPlan, CriticalResult
-from testbench.campaign.probing import Side, evidence, most_values
+from testbench.campaign.plans.critical import Answer, CriticalPlan, CriticalResult
+from testbench.campaign.plans.probing import Side, evidence, most_values
+from testbench.campaign.plans.search import METHODS, SCANNED, CriticalSearch, split_quantity
 from testbench.campaign.records import Outcome, Point, RunRow, Wanted
-from testbench.campaign.search import METHODS, SCANNED, CriticalSearch, split_quantity
-from testbench.campaign.statistics import Tally, wilson
+from testbench.campaign.statistics.shares import Tally, wilson
 from tests.testbench.campaign.worlds import Logistic, failing, play, row, searched
 
 SEARCH = CriticalSearch("duration", Decimal("0.05"), Decimal("3"), Decimal("0.05"), "s", batch=10, most=200)

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from testbench.campaign.schema import CampaignFile, parse_campaign
-from testbench.campaign.store import Recipe, open_store
+from testbench.campaign.file.schema import CampaignFile, parse_campaign
+from testbench.campaign.store.store import Recipe, open_store
 from testbench.cli import main
 from tests.testbench.campaign.workers import row_of, spec
 

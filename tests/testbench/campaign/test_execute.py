@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from fi_gateway.marked_yaml import FileErrors
-from testbench.campaign.execute import Workshop, make_run
+from testbench.campaign.making.execute import Workshop, make_run
 from testbench.campaign.records import Outcome
 from testbench.run import run_scenario
 from testbench.scenario import load_scenario

@@ -6,9 +6,9 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
-from testbench.campaign.export import injection_table, run_table, write_csv, write_parquet
+from testbench.campaign.file.values import number_of
 from testbench.campaign.records import Outcome, RunRow
-from testbench.campaign.values import number_of
+from testbench.campaign.store.export import injection_table, run_table, write_csv, write_parquet
 from testbench.errors import BenchError
 from tests.testbench.campaign.workers import row_of, spec
 

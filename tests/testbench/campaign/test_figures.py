@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from testbench.campaign.figures import (
+from testbench.campaign.report.figures import (
     Column,
     Curve,
     Share,

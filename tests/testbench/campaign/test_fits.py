@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from testbench.campaign.fits import quadratic_fit
-from testbench.campaign.statistics import NotEstimableError
+from testbench.campaign.statistics.fits import quadratic_fit
+from testbench.campaign.statistics.shares import NotEstimableError
 
 DURATIONS = [0.05 * step for step in range(1, 11)] + [0.5 + 0.25 * step for step in range(1, 11)]
 """Those of the paper's first experiment, s."""

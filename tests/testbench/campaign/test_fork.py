@@ -11,9 +11,9 @@ from canopen_exo.bus.node import MS
 from canopen_exo.bus.trace import trace_hash
 from canopen_exo.plan import BusPlan
 from fi_gateway.schema import build_injectors
-from testbench.campaign.early import LOOK_NS
-from testbench.campaign.execute import Workshop, make_run
-from testbench.campaign.fork import SNAPSHOT_NS, snapshot_distance
+from testbench.campaign.making.early import LOOK_NS
+from testbench.campaign.making.execute import Workshop, make_run
+from testbench.campaign.making.fork import SNAPSHOT_NS, snapshot_distance
 from testbench.campaign.records import Outcome, RunRow, RunSpec
 from testbench.rig import RigParams, build_rig
 from testbench.run import CHUNK_NS, rig_params
@@ -166,20 +166,23 @@ def test_the_gateway_of_a_branch_stands_where_that_of_a_straight_run_does(name: 
     assert len(branch.rack.truth) == len(straight.rack.truth)
 
 
-def state(thing: object) -> object:
-    """All that `__reduce__` says, all the way down, as plain values."""
+def state(thing: object, within: tuple[int, ...] = ()) -> object:
+    """All that `__reduce__` says, all the way down, as plain values. within: what it is a part of."""
+    if id(thing) in within:
+        return "its own whole"
+    within = (*within, id(thing))
     if isinstance(thing, Generator):
         return thing.bit_generator.state
     if isinstance(thing, type):
         return thing.__name__
     if isinstance(thing, list | tuple):
-        return [state(one) for one in thing]
+        return [state(one, within) for one in thing]
     if isinstance(thing, dict):
-        return {key: state(value) for key, value in thing.items()}
+        return {key: state(value, within) for key, value in thing.items()}
     if isinstance(thing, int | float | str | bytes | bytearray | Enum) or thing is None:
         return thing
     made = thing.__reduce_ex__(4)
-    return [type(thing).__name__, *(state(part) for part in made[1:3])] if not isinstance(made, str) else made
+    return [type(thing).__name__, *(state(part, within) for part in made[1:3])] if not isinstance(made, str) else made
 
 
 def test_a_fault_that_acts_from_power_up_is_run_straight_and_says_so(workshop: Workshop) -> None:
@@ -211,9 +214,9 @@ def test_a_run_whose_faults_never_activate_costs_no_simulation(
     def refuse(*args: object) -> None:
         raise AssertionError("a rig was built")
 
-    monkeypatch.setattr("testbench.campaign.execute.build_rig", refuse)
-    monkeypatch.setattr("testbench.campaign.fork.build_rig", refuse)
-    monkeypatch.setattr("testbench.campaign.fork.Trunk.branch", refuse)
+    monkeypatch.setattr("testbench.campaign.making.execute.build_rig", refuse)
+    monkeypatch.setattr("testbench.campaign.making.fork.build_rig", refuse)
+    monkeypatch.setattr("testbench.campaign.making.fork.Trunk.branch", refuse)
     row = make_run(silent, workshop)
     assert row.outcome is Outcome.NOT_ACTIVATED
     assert row.trace_hash == row.golden_hash

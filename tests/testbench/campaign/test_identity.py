@@ -2,7 +2,7 @@
 
 import pytest
 
-from testbench.campaign.identity import code_version, identity, with_seed
+from testbench.campaign.making.identity import code_version, identity, with_seed
 from testbench.errors import BenchError
 
 

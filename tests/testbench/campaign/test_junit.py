@@ -4,8 +4,8 @@ from xml.etree.ElementTree import Element, fromstring
 
 import pytest
 
-from testbench.campaign.junit import junit_text
 from testbench.campaign.records import Outcome
+from testbench.campaign.report.junit import junit_text
 from tests.testbench.campaign.made_rows import axis, meta, point, row
 
 HERE, THERE, NEVER = point(duration="0.1 s"), point(duration="0.2 s"), point(duration="0.3 s")

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
-from testbench.campaign.logistic import Level, curve_misfit, fall_misfit, logistic_fit, rising_shares
-from testbench.campaign.statistics import NotEstimableError, Tally
+from testbench.campaign.statistics.logistic import Level, curve_misfit, fall_misfit, logistic_fit, rising_shares
+from testbench.campaign.statistics.shares import NotEstimableError, Tally
 from tests.testbench.campaign.worlds import Logistic
 
 XS = [0.1 * step for step in range(1, 10)]

@@ -2,8 +2,8 @@
 
 import pytest
 
-from testbench.campaign.markdown import table_of
 from testbench.campaign.records import Outcome
+from testbench.campaign.report.markdown import table_of
 from testbench.errors import BenchError
 from tests.testbench.campaign.made_rows import axis, figure, meta, over_duration, row
 

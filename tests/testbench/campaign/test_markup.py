@@ -5,7 +5,7 @@ from html.parser import HTMLParser
 from hypothesis import given
 from hypothesis import strategies as st
 
-from testbench.campaign.markup import Html, render, table, tag
+from testbench.campaign.report.markup import Html, render, table, tag
 
 
 class Texts(HTMLParser):

@@ -2,8 +2,8 @@
 
 import shlex
 
-from testbench.campaign.notable import latest_noticed, odd, replay_command, slowest, worst
 from testbench.campaign.records import Outcome
+from testbench.campaign.report.notable import latest_noticed, odd, replay_command, slowest, worst
 from tests.testbench.campaign.made_rows import point, row
 
 HERE, THERE = point(duration="0.1 s"), point(duration="0.2 s")

@@ -13,7 +13,7 @@ from canopen_exo.bus.node import ErrorState, PortState
 from canopen_exo.bus.realtime import RECEIVED
 from fi_gateway.activation import Activation
 from hlc.limits import limits_of
-from testbench.campaign.outcomes import first_reaction, outcome_of, phase_at, severity
+from testbench.campaign.making.outcomes import first_reaction, outcome_of, phase_at, severity
 from testbench.campaign.records import Outcome
 from testbench.record import RigEvent, RunRecord, Truth
 from testbench.verdict import Judgement, judge

@@ -9,8 +9,8 @@ import pytest
 from canopen_exo.bus.node import NEVER
 from fi_gateway.control_socket import Listing
 from fi_gateway.errors import FaultError
-from testbench.campaign import over_bus
-from testbench.campaign.over_bus import OverBus, Rigging, arm, check_scenario
+from testbench.campaign.making import over_bus
+from testbench.campaign.making.over_bus import OverBus, Rigging, arm, check_scenario
 from testbench.campaign.records import Outcome, RunRow, RunSpec
 from testbench.errors import BenchError
 from testbench.realtime_run import RealTimeRun

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from testbench.campaign.execute import Workshop, make_run
-from testbench.campaign.identity import code_version
-from testbench.campaign.markdown import table_of
-from testbench.campaign.meta import Meta
+from testbench.campaign.file.rules import FixedRuns
+from testbench.campaign.file.schema import Campaign, load_campaign
+from testbench.campaign.making.execute import Workshop, make_run
+from testbench.campaign.making.identity import code_version
 from testbench.campaign.records import Point, RunRow, Wanted
-from testbench.campaign.rules import FixedRuns
-from testbench.campaign.schema import Campaign, load_campaign
+from testbench.campaign.report.markdown import table_of
+from testbench.campaign.report.meta import Meta
 
 ROOT = Path(__file__).resolve().parents[3]
 DOCUMENT = (ROOT / "docs" / "paper.md").read_text(encoding="utf-8")

@@ -4,9 +4,9 @@ import math
 
 import pytest
 
-from testbench.campaign.phases import by_phase
 from testbench.campaign.records import Outcome
-from testbench.campaign.statistics import Tally, clopper_pearson, wilson
+from testbench.campaign.statistics.phases import by_phase
+from testbench.campaign.statistics.shares import Tally, clopper_pearson, wilson
 
 FAIL, PASS, LOST = Outcome.FAILURE_SILENT, Outcome.MASKED, Outcome.INVALID
 

@@ -4,10 +4,10 @@ import random
 
 import pytest
 
-from testbench.campaign.plans import BLOCK, GridPlan, SequentialPlan
+from testbench.campaign.file.rules import FixedRuns, Until
+from testbench.campaign.plans.grid import BLOCK, GridPlan, SequentialPlan
 from testbench.campaign.records import Outcome, Plan, Point, RunRow, Wanted
-from testbench.campaign.rules import FixedRuns, Until
-from testbench.campaign.statistics import wilson
+from testbench.campaign.statistics.shares import wilson
 
 A, B = Point((("x", "1"),)), Point((("x", "2"),))
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from testbench.campaign.executor import ATTEMPTS, ExecutorError
-from testbench.campaign.pool import Pool
+from testbench.campaign.making.executor import ATTEMPTS, ExecutorError
+from testbench.campaign.making.pool import Pool
 from testbench.campaign.records import Outcome, RunRow, RunSpec
 from testbench.errors import BenchError
 from tests.testbench.campaign.workers import HERE, row_of, spec
@@ -97,7 +97,7 @@ def test_processes_that_never_get_ready_are_an_error(capfd: pytest.CaptureFixtur
 
 def test_program_that_was_changed_meanwhile_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     """A process that is started later reads the changed files: its rows would have the version of the old ones."""
-    monkeypatch.setattr("testbench.campaign.pool.code_version", lambda: "0.1.0+before")
+    monkeypatch.setattr("testbench.campaign.making.pool.code_version", lambda: "0.1.0+before")
     with pool("quick") as executor:
         executor.submit(spec(0))
         with pytest.raises(ExecutorError, match=r"changed while it ran: .* has code .*, this one 0\.1\.0\+before"):

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from testbench.campaign.ranking import Effect, Ranking, rank_parameters, spearman
-from testbench.campaign.statistics import NotEstimableError
+from testbench.campaign.statistics.ranking import Effect, Ranking, rank_parameters, spearman
+from testbench.campaign.statistics.shares import NotEstimableError
 
 N = 200
 

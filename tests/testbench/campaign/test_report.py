@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from testbench.campaign.markdown import table_of
-from testbench.campaign.meta import Meta
 from testbench.campaign.records import Outcome, RunRow
-from testbench.campaign.report import html_text, write_report
+from testbench.campaign.report.markdown import table_of
+from testbench.campaign.report.meta import Meta
+from testbench.campaign.report.page import html_text, write_report
 from tests.testbench.campaign.made_rows import RMSE, axis, figure, meta, over_duration, point, row
 
 DURATIONS = ("0.1 s", "0.2 s", "0.3 s", "0.4 s", "0.5 s")

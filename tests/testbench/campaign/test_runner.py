@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from testbench.campaign.executor import Executor
+from testbench.campaign.file.schema import Campaign
+from testbench.campaign.making.executor import Executor
 from testbench.campaign.records import Known, Outcome, Plan, Point, RunRow, RunSpec, Wanted
 from testbench.campaign.runner import Finished, Progress, Runner, Way
-from testbench.campaign.schema import Campaign
-from testbench.campaign.store import Store, StoreError, open_store
+from testbench.campaign.store.store import Store, StoreError, open_store
 from tests.testbench.campaign.campaigns import small
 from tests.testbench.campaign.workers import row_of
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from testbench.campaign.samples import bootstrap_interval, mean_interval, median_interval, summary
-from testbench.campaign.statistics import Interval, NotEstimableError
+from testbench.campaign.statistics.samples import bootstrap_interval, mean_interval, median_interval, summary
+from testbench.campaign.statistics.shares import Interval, NotEstimableError
 
 CAMPAIGNS = 2000
 """Seeds: four standard errors of a coverage of 95 % are 2 %."""

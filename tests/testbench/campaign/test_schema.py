@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 
 from fi_gateway.marked_yaml import FileErrors
-from testbench.campaign.combinations import CombinationPlan
+from testbench.campaign.file.rules import Figure, FixedRuns, StopEarly, Until
+from testbench.campaign.file.schema import load_campaign, parse_campaign
+from testbench.campaign.plans.combinations import CombinationPlan
+from testbench.campaign.plans.search import CombinationSearch, CriticalSearch
 from testbench.campaign.records import Point, Wanted
-from testbench.campaign.rules import Figure, FixedRuns, StopEarly, Until
-from testbench.campaign.schema import load_campaign, parse_campaign
-from testbench.campaign.search import CombinationSearch, CriticalSearch
 from testbench.scenario import parse_scenario
 from tests.testbench.campaign.campaigns import SCENARIO, changed, small, written
 

@@ -2,13 +2,13 @@
 
 from decimal import Decimal
 
-from testbench.campaign.combinations import CombinationPlan
-from testbench.campaign.critical import CriticalPlan
-from testbench.campaign.meta import Meta
+from testbench.campaign.plans.combinations import CombinationPlan
+from testbench.campaign.plans.critical import CriticalPlan
+from testbench.campaign.plans.search import CombinationSearch, CriticalSearch
 from testbench.campaign.records import Outcome, Point, RunRow
-from testbench.campaign.report import html_text
-from testbench.campaign.search import CombinationSearch, CriticalSearch
-from testbench.campaign.searched import critical_results, critical_table, search_section
+from testbench.campaign.report.meta import Meta
+from testbench.campaign.report.page import html_text
+from testbench.campaign.report.searched import critical_results, critical_table, search_section
 from tests.testbench.campaign.made_rows import axis, meta, point, row
 from tests.testbench.campaign.test_report import Page
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from testbench.campaign.records import FAILURES, NO_STATEMENT, Outcome
-from testbench.campaign.statistics import (
+from testbench.campaign.statistics.shares import (
     Interval,
     NotEstimableError,
     Tally,

@@ -3,7 +3,7 @@
 import doctest
 from pathlib import Path
 
-from testbench.campaign.statistics import clopper_pearson
+from testbench.campaign.statistics.shares import clopper_pearson
 
 FILE = Path(__file__).parents[3] / "docs" / "statistics.md"
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from testbench.campaign.records import Outcome, Point, RunRow
-from testbench.campaign.store import Invocation, Recipe, Store, StoreError, open_store
+from testbench.campaign.store.store import Invocation, Recipe, Store, StoreError, open_store
 from tests.testbench.campaign.workers import row_of, spec
 
 RECIPE = Recipe("name: x\nseed: 0\n", "1", "failure", 0.25)
@@ -172,7 +172,7 @@ def test_full_disk_is_said_and_what_was_written_is_kept(store: Store, path: Path
 LIMITED = """
 import resource, signal, sys
 from pathlib import Path
-from testbench.campaign.store import open_store
+from testbench.campaign.store.store import open_store
 from tests.testbench.campaign.test_store import fill
 store = open_store(Path(sys.argv[1]), write=True)
 resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, 300_000))

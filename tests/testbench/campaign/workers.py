@@ -5,8 +5,8 @@ import signal
 import threading
 from pathlib import Path
 
+from testbench.campaign.making.worker import MakeRun
 from testbench.campaign.records import InjectionRow, Outcome, Point, RunRow, RunSpec, Wanted
-from testbench.campaign.worker import MakeRun
 
 HERE = "tests.testbench.campaign.workers"
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from testbench.campaign.critical import CriticalPlan, CriticalResult
+from testbench.campaign.plans.critical import CriticalPlan, CriticalResult
+from testbench.campaign.plans.search import CriticalSearch
 from testbench.campaign.records import Known, Outcome, Plan, Point, RunRow, Wanted
-from testbench.campaign.search import CriticalSearch
 
 Draw = Callable[[Wanted], Outcome]
 

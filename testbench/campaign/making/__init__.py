@@ -1,0 +1,1 @@
+"""How runs are made: one run, and the executors that have many made."""

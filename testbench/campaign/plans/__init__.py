@@ -1,0 +1,1 @@
+"""Which runs a campaign wants: grids, sequential rules, searches."""

@@ -1,0 +1,1 @@
+"""What a campaign shows: one page, its tables and figures, JUnit, Markdown."""

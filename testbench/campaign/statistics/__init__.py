@@ -1,0 +1,1 @@
+"""What numbers of runs say: shares, samples, fits, rankings, gait phases."""
