@@ -106,6 +106,8 @@ class Trunk:
         self._show(gateway, snapshot.now, until_active=False)
         gateway.frames[:] = snapshot.frames
         rig = copy.deepcopy(trunk, {**_shared(trunk), id(trunk.gateway): gateway})
+        for medium in rig.loop.media:
+            gateway.join(medium)
         rig.loop.resume(self._rows[: snapshot.rows])
         rig.rack.truth.extend(self._truth[: snapshot.truth])
         rig.controller.samples.extend(self._samples[: snapshot.samples])
