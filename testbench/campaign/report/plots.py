@@ -5,7 +5,7 @@ units beside the same paper's numbers; where there are too many, all are taken t
 """
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -35,7 +35,7 @@ from testbench.campaign.report.measured import (
 from testbench.campaign.report.meta import Meta
 from testbench.campaign.report.tables import Table, number
 from testbench.campaign.statistics.fits import QuadraticFit, quadratic_fit
-from testbench.campaign.statistics.samples import Summary, mean_interval, summary
+from testbench.campaign.statistics.samples import Summary, mean_interval, median_interval, summary
 from testbench.campaign.statistics.shares import Interval, NotEstimableError, wilson
 
 if TYPE_CHECKING:
@@ -180,26 +180,28 @@ def panel_title(panel: Panel) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Described:
-    """The values of y at one x. mean: interval of the mean, None for one value, for equal ones, for dependent runs."""
+    """The values of y at one x. mean, median: their intervals, None where too few or equal, for dependent runs."""
 
     x: float
     values: Summary
     mean: Interval | None
+    median: Interval | None
 
 
 def described_columns(panel: Panel) -> list[Described]:
     """What is said about the values at every x with runs that have one."""
     found = ((x, values_of(rows, panel.wanted.y)) for x, rows in panel.columns)
-    return [
-        Described(x, summary(values), None if panel.together else _mean_interval(values))
-        for x, values in found
-        if values
-    ]
+    described = []
+    for x, values in found:
+        if values:
+            mean, median = (None if panel.together else _due(of, values) for of in (mean_interval, median_interval))
+            described.append(Described(x, summary(values), mean, median))
+    return described
 
 
-def _mean_interval(values: Sequence[float]) -> Interval | None:
+def _due(interval_of: Callable[[Sequence[float]], Interval], values: Sequence[float]) -> Interval | None:
     try:
-        return mean_interval(values)
+        return interval_of(values)
     except NotEstimableError:
         return None
 
@@ -235,8 +237,10 @@ def values_section(rows: Sequence[RunRow], meta: Meta) -> Html | None:
     if not tables:
         return None
     note = (
-        "Mean with its 95 % interval (Student's t); quartiles: a quarter of the runs below the first, a quarter above "
-        "the second. Behind a published number stands whether it is inside the interval of our mean, below or above it."
+        "Mean with its 95 % interval (Student's t), which covers less where single values lie far above the others; "
+        "median with its own (order statistics, from 6 runs on), which holds for any distribution; quartiles: a "
+        "quarter of the runs below the first, a quarter above the second. Behind a published number stands whether it "
+        "is inside the interval of our mean, below or above it."
     )
     heading = tag("h2", "Numbers of the figures")
     return tag("section", heading, *tables, tag("p", note, class_="note"), id="values")
@@ -258,7 +262,7 @@ def _values_table(panel: Panel, described: Sequence[Described]) -> Table:
             f"{one.x:g}",
             str(found.n),
             f"{number(found.mean)}{_ends(one.mean)}",
-            number(found.median),
+            f"{number(found.median)}{_ends(one.median)}",
             f"{number(found.q1)}, {number(found.q3)}",
             number(found.low),
             number(found.high),
