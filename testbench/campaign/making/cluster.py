@@ -179,6 +179,8 @@ class Cluster(Executor):
             if isinstance(said, OtherCode):
                 wrong = complaints({said.worker: said.version}, self._version)
                 raise ExecutorError(f"--cluster {self._address}: {wrong[0]}")
+            if said.ends:
+                raise ExecutorError(f"--cluster {self._address}: worker's machine: {said.text}")
             return given_up(spec, Outcome.CRASHED, said.text, 1, 0.0, "")
         if future.status != "error":
             raise ExecutorError(f"--cluster {self._address}: run {spec.identity[:12]} was {future.status} there")

@@ -159,6 +159,21 @@ def test_runs_without_a_statement_are_told_and_exit_3(
     assert "crashed" not in capsys.readouterr().out
 
 
+def test_result_folder_that_cannot_be_written_ends_the_campaign(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], fake: Callable[[str], None]
+) -> None:
+    """As a store that cannot be written does: exit code 2, the message, no row; the same command goes on from there."""
+    fake("no_folder")
+    store = tmp_path / "s.sqlite"
+    arguments = ["campaign", "run", str(written(tmp_path)), "--out", str(store), "--jobs", "1", "--no-report"]
+    assert main(arguments) == 2
+    assert "result folder there: cannot be written" in capsys.readouterr().err
+    assert rows_in(store) == []
+    fake("quick")
+    assert main(arguments) == 0
+    assert len(rows_in(store)) == 6
+
+
 def test_changes_are_another_experiment(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fake: Callable[[str], None]
 ) -> None:
