@@ -27,6 +27,9 @@ if TYPE_CHECKING:
     from testbench.process import Orders
 
 INTERRUPTED: Final = 130
+_RETRY: Final = (
+    "make runs that crashed or hung once more, with --realtime invalid ones too (they may come out otherwise)"
+)
 
 
 def add_campaign_verbs(verbs: Verbs, show: Callable[[str], None]) -> None:
@@ -48,7 +51,7 @@ def add_campaign_verbs(verbs: Verbs, show: Callable[[str], None]) -> None:
         help="change the scenario of every run, as for `exo-hil run`; may be repeated",
     )
     run.add_argument("--no-fork", action="store_true", help="every run from power-up, not from the golden run's middle")
-    run.add_argument("--retry", action="store_true", help="make runs that crashed or hung once more")
+    run.add_argument("--retry", action="store_true", help=_RETRY)
     run.add_argument("--no-report", action="store_true", help="write no report at the end")
     run.add_argument("--cluster", metavar="ADDRESS", help="on the workers of dask.distributed, as in tcp://HOST:8786")
     run.add_argument("--realtime", action="store_true", help="one after another as processes against the clock")
@@ -154,7 +157,8 @@ def _run(options: argparse.Namespace, show: Callable[[str], None]) -> int:
     try:
         remember(store, campaign)
         if options.retry:
-            store.runs.forget((Outcome.CRASHED, Outcome.HANG), version)
+            again = (Outcome.CRASHED, Outcome.HANG, *([] if rigging is None else [Outcome.INVALID]))
+            store.runs.forget(again, version)
         runner = Runner(campaign, store, way)
         with Orders().taken() as orders, shown(campaign.name) as watch:
             runner.prepare()
@@ -189,9 +193,7 @@ def _rigging(options: argparse.Namespace) -> "Rigging | None":
     return Rigging(named_buses(options), without, options.fifo, listen, options.control or "")
 
 
-def _executor(
-    options: argparse.Namespace, campaign: "Campaign", rigging: "Rigging | None", jobs: int
-) -> "Executor":
+def _executor(options: argparse.Namespace, campaign: "Campaign", rigging: "Rigging | None", jobs: int) -> "Executor":
     """Where the runs are made. Raises BenchError and FaultError for runs that cannot be made there."""
     if rigging is not None:
         from testbench.campaign.making.over_bus import OverBus, check_scenario

@@ -110,9 +110,7 @@ def make_run(spec: RunSpec, workshop: Workshop) -> RunRow:
         row = judged(spec, scenario, pair, judgement)
         if keeps(spec, row.outcome):
             sim_s, wall_s = made.sim_ns / 1e9, time.perf_counter() - wall  # of the faulted run, golden made before
-            write_kept(
-                spec, result_of(scenario, made.golden.record, made.record, sim_time_s=sim_s, wall_time_s=wall_s)
-            )
+            write_kept(spec, result_of(scenario, made.golden.record, made.record, sim_time_s=sim_s, wall_time_s=wall_s))
     return replace(
         row,
         started=started.isoformat(timespec="milliseconds"),

@@ -14,11 +14,13 @@ from pathlib import Path
 import pytest
 
 import testbench.campaign.making.pool
+import testbench.cli_campaign
 from testbench.campaign.records import Outcome, RunRow
 from testbench.campaign.store.store import open_store
 from testbench.cli import main
 from tests.testbench.campaign.campaigns import written
-from tests.testbench.campaign.workers import HERE
+from tests.testbench.campaign.test_runner import Here
+from tests.testbench.campaign.workers import HERE, row_of
 
 # The program with workers of a test, and with the interrupt key at work also in the background of a shell.
 PROGRAM = """
@@ -172,6 +174,22 @@ def test_result_folder_that_cannot_be_written_ends_the_campaign(
     fake("quick")
     assert main(arguments) == 0
     assert len(rows_in(store)) == 6
+
+
+@pytest.mark.parametrize("realtime", [True, False])
+def test_retry_makes_invalid_runs_again_where_they_may_come_out_otherwise(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, realtime: bool
+) -> None:
+    """Late runs over a bus are an accident; in lock-step the same scenario and seed prove nothing again."""
+    outcomes = iter([Outcome.INVALID] * 2 + [Outcome.MASKED] * 4)
+    monkeypatch.setattr(testbench.cli_campaign, "_executor", lambda *_: Here(lambda one: row_of(one, next(outcomes))))
+    store = tmp_path / "s.sqlite"
+    arguments = ["campaign", "run", str(written(tmp_path)), "--out", str(store), "--no-report", "--runs", "1"]
+    arguments += ["--realtime"] if realtime else []
+    assert main(arguments) == 3
+    assert main(arguments) == 3, "not by itself"
+    assert main([*arguments, "--retry"]) == (0 if realtime else 3)
+    assert {row.outcome for row in rows_in(store)} == {Outcome.MASKED if realtime else Outcome.INVALID}
 
 
 def test_changes_are_another_experiment(
