@@ -5,13 +5,13 @@ units beside the same paper's numbers; where there are too many, all are taken t
 """
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from testbench.campaign.file.axes import Axis
 from testbench.campaign.file.rules import Figure
-from testbench.campaign.records import RunRow
+from testbench.campaign.records import Point, RunRow
 from testbench.campaign.report.figures import (
     Column,
     Curve,
@@ -26,7 +26,6 @@ from testbench.campaign.report.measured import (
     count,
     ended_early,
     is_share,
-    motion_of,
     number_at,
     quantity,
     stating,
@@ -56,7 +55,7 @@ _GOLDEN_RATIO: Final = 0.618034
 class Panel:
     """A figure wanted, for one combination of the other axes (`held`, in words), with its runs by rising x.
 
-    motion_s: of a run that nothing cut short. together: for all combinations instead; runs at one x then share seeds
+    motions: as in Meta. together: for all combinations instead; runs at one x then share seeds
     and depend on each other, so that there are no intervals.
     """
 
@@ -64,7 +63,7 @@ class Panel:
     axis: Axis
     held: str
     together: bool
-    motion_s: float
+    motions: Mapping[Point, float]
     columns: tuple[tuple[float, tuple[RunRow, ...]], ...]
 
     @property
@@ -84,7 +83,6 @@ def panels(rows: Sequence[RunRow], meta: Meta) -> list[Panel]:
 
 
 def _panels(rows: Sequence[RunRow], meta: Meta, wanted: Figure) -> Iterator[Panel]:
-    motion_s = motion_of(rows)
     (axis,) = (axis for axis in meta.axes if axis.name == wanted.x)
     inside: dict[tuple[tuple[str, str], ...], dict[float, list[RunRow]]] = {}
     for point, found in by_point(rows, meta.points).items():
@@ -98,11 +96,11 @@ def _panels(rows: Sequence[RunRow], meta: Meta, wanted: Figure) -> Iterator[Pane
             for x, found in columns.items():
                 pooled.setdefault(x, []).extend(found)
         names = " and ".join(one.name for one in meta.axes if one is not axis)
-        yield Panel(wanted, axis, f"all values of {names} together", True, motion_s, _by_x(pooled))
+        yield Panel(wanted, axis, f"all values of {names} together", True, meta.motions, _by_x(pooled))
         return
     for held, columns in inside.items():
         words = ", ".join(f"{name} {text}" for name, text in held)
-        yield Panel(wanted, axis, words, False, motion_s, _by_x(columns))
+        yield Panel(wanted, axis, words, False, meta.motions, _by_x(columns))
 
 
 def _by_x(columns: dict[float, list[RunRow]]) -> tuple[tuple[float, tuple[RunRow, ...]], ...]:
@@ -297,7 +295,7 @@ def _curve(fits: Fits | None) -> Curve | None:
 
 def _cut_words(panel: Panel) -> str:
     """What has to be said under numbers of runs that were cut short, "" for none."""
-    early = ended_early(panel.rows, panel.motion_s)
+    early = ended_early(panel.rows, panel.motions)
     if not early:
         return ""
     subject, their = ("1 run", "its") if early == 1 else (f"{early} runs", "their")

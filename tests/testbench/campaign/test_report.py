@@ -169,10 +169,19 @@ def test_runs_cut_short_are_told_under_their_numbers() -> None:
     """After an early stop an RMSE covers less of the motion; it must not pass for one of the whole."""
     points, rows = over_duration(["0.1 s"], {"0.1 s": [1.0, 2.0]})
     cut = row(points[0], 2, metrics={RMSE: 3.0}, ended_s=2.5)
-    about = meta([axis("duration", "0.1 s")], points, [figure()])
+    about = meta([axis("duration", "0.1 s")], points, [figure()], motions={points[0]: 7.0})
     assert "1 run ended early: its numbers cover a part of the motion." in words([*rows, cut], about)
     table = table_of([*rows, cut], about, "values 1").splitlines()[0]
     assert table.endswith("in rad (1 run ended early: its numbers cover a part of the motion):")
+    assert "ended early" not in words(rows, about)
+    assert "1 run ended early" in words([cut], about), "also where no run went to its end"
+
+
+def test_motions_of_other_length_are_not_cut_short() -> None:
+    """An axis over the length of the motion: each run is held against its own point's."""
+    points = [point(duration="2 s"), point(duration="7 s")]
+    rows = [row(points[k], 0, metrics={RMSE: 1.0}, ended_s=ended) for k, ended in enumerate((2.0, 7.0))]
+    about = meta([axis("duration", "2 s", "7 s")], points, [figure()], motions={points[0]: 2.0, points[1]: 7.0})
     assert "ended early" not in words(rows, about)
 
 
