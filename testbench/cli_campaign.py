@@ -164,7 +164,7 @@ def _run(options: argparse.Namespace, show: Callable[[str], None]) -> int:
             runner.prepare()
             finished = runner.run(executor, watch, _stopping(orders))
         rows = store.runs.all(brief=True)
-        show(_run_json(campaign, store, rows, finished) if options.json else _run_text(store, rows, finished))
+        show(_run_json(campaign, store, rows, finished) if options.json else _run_text(campaign, store, rows, finished))
         if finished.interrupted:
             _say(f"interrupted; the same command goes on from here: {len(rows)} runs are in {path}")
             return INTERRUPTED
@@ -242,12 +242,13 @@ def _command() -> str:
     return shlex.join(["exo-hil", *sys.argv[1:]])
 
 
-def _run_text(store: "Store", rows: "list[RunRow]", finished: "Finished") -> str:
+def _run_text(campaign: "Campaign", store: "Store", rows: "list[RunRow]", finished: "Finished") -> str:
     """What `campaign run` prints at its end."""
-    from testbench.campaign.words import point_lines, time_text
+    from testbench.campaign.words import interval_note, point_lines, time_text
 
     far = finished.progress
     lines = point_lines(store.points.all(), rows)
+    lines += [note] if (note := interval_note(campaign.rule)) else []
     rate = f"{far.per_minute:.1f} runs/min" if far.made else "nothing was missing"
     lines.append(f"{far.done} of {far.wanted} runs; {far.made} made in {time_text(far.elapsed_s)} ({rate})")
     return "\n".join([*lines, *_asides(store, rows), f"store: {store.path}"]) + "\n"

@@ -36,6 +36,7 @@ from testbench.campaign.report.tables import Table, number
 from testbench.campaign.statistics.fits import QuadraticFit, quadratic_fit
 from testbench.campaign.statistics.samples import Summary, mean_interval, summary
 from testbench.campaign.statistics.shares import Interval, NotEstimableError, wilson
+from testbench.campaign.words import interval_note
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as DrawnFigure
@@ -113,7 +114,9 @@ def figure_section(rows: Sequence[RunRow], meta: Meta) -> tuple[Html | None, int
     found = [one for one in drawn if one is not None]
     if not found:
         return None, 0
-    return tag("section", tag("h2", "Figures"), tag("div", *found, class_="figures"), id="figures"), len(drawn)
+    note = interval_note(meta.rule) if any(is_share(one.y) for one in meta.figures) else ""
+    said = [tag("p", note, class_="note")] if note else []
+    return tag("section", tag("h2", "Figures"), tag("div", *found, class_="figures"), *said, id="figures"), len(drawn)
 
 
 def _figure(panel: Panel, k: int) -> Html | None:

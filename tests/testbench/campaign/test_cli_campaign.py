@@ -176,6 +176,18 @@ def test_result_folder_that_cannot_be_written_ends_the_campaign(
     assert len(rows_in(store)) == 6
 
 
+def test_table_of_a_rule_that_asks_repeatedly_says_what_its_intervals_are_worth(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], fake: Callable[[str], None]
+) -> None:
+    """Not plain 95 %."""
+    fake("quick")
+    rule = "runs: {until: {outcome: failure, width: 0.9}, batch: 4, least: 4, most: 8}"
+    file = written(tmp_path, ("runs: 3", rule))
+    options = ["--out", str(tmp_path / "s.sqlite"), "--jobs", "1", "--no-report"]
+    assert main(["campaign", "run", str(file), *options]) == 0
+    assert "cover less often than 95 % (95.2 % on average and 90.5 % at worst" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("realtime", [True, False])
 def test_retry_makes_invalid_runs_again_where_they_may_come_out_otherwise(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, realtime: bool

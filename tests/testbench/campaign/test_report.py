@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from testbench.campaign.file.rules import Until
 from testbench.campaign.records import Outcome, RunRow
 from testbench.campaign.report.markdown import table_of
 from testbench.campaign.report.meta import Meta
@@ -156,6 +157,16 @@ def test_shares_leave_out_what_makes_no_statement_and_say_so() -> None:
     assert "1 of 3 runs failed, 33.3 % over all points together." in said
     assert "33.3 % (6.1 to 79.2 %)" in said
     assert "In 2 runs a limit of torque, speed or angle was exceeded." in said
+
+
+def test_intervals_that_were_asked_for_repeatedly_say_so_where_they_stand() -> None:
+    """Rule `until`: beside table and figure of shares; a fixed number of runs has nothing to say."""
+    at = point(duration="0.1 s")
+    rows = [row(at, k, Outcome.MASKED) for k in range(20)]
+    axes, shown, note = [axis("duration", "0.1 s")], [figure("failure")], "cover less often than 95 %"
+    until = meta(axes, [at], shown, rule=Until("failure", 0.1, 20, 20, 400))
+    assert words(rows, until).count(note) == 2
+    assert note not in words(rows, meta(axes, [at], shown))
 
 
 def test_unfinished_campaign_says_what_is_missing() -> None:
