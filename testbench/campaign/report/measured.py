@@ -8,7 +8,7 @@ from testbench.campaign.file.axes import Axis
 from testbench.campaign.file.rule_specs import RUN_NUMBERS
 from testbench.campaign.file.rules import OUTCOMES
 from testbench.campaign.plans.search import CombinationSearch, CriticalSearch
-from testbench.campaign.records import FAILURES, NO_STATEMENT, Point, RunRow
+from testbench.campaign.records import FAILURES, NO_STATEMENT, UNITS, Point, RunRow
 from testbench.campaign.report.meta import Meta
 from testbench.campaign.statistics.shares import outcomes_named
 
@@ -28,7 +28,6 @@ _NAMED: Final = {
     "ended_s": ("end of the motion", "s"),
 }
 """Numbers of a run, which belong to no joint."""
-_UNITS: Final = (("_rad_s", "rad/s"), ("_rad", "rad"), ("_nm", "N m"), ("_deg", "deg"), ("_rpm", "rpm"), ("_s", "s"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +50,7 @@ def quantity(name: str) -> Quantity:
         return Quantity(name, *_NAMED[name])
     joint, dot, what = name.rpartition(".")
     unit, words = "", what
-    for ending, found in _UNITS:
+    for ending, found in UNITS:
         if what.endswith(ending):
             unit, words = found, what.removesuffix(ending)
             break

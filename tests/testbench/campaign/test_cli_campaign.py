@@ -112,7 +112,8 @@ def test_run_prints_a_table_and_says_where_it_is(
     out, err = capsys.readouterr()
     lines = out.splitlines()
     assert lines[0].split("  ")[0] == "point"
-    assert "  0.05 s    3     1       2               67 % (21 to 94 %)" in lines[1] or "33 % (6 to 79 %)" in lines[1]
+    assert "  0.05 s    3     " in lines[1]
+    assert "66.7 % (20.8 to 93.9 %)" in lines[1] or "33.3 % (6.1 to 79.2 %)" in lines[1]
     assert "6 of 6 runs; 6 made in " in out
     assert "store: results/campaigns/small.sqlite" in out
     assert "report: results/campaigns/small.html, results/campaigns/small.xml" in err

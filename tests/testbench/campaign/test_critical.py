@@ -11,7 +11,7 @@ from scipy import integrate, stats
 
 from testbench.campaign.plans.critical import Answer, CriticalPlan, CriticalResult
 from testbench.campaign.plans.probing import Side, evidence, most_values
-from testbench.campaign.plans.search import METHODS, SCANNED, CriticalSearch, split_quantity
+from testbench.campaign.plans.search import METHODS, SCANNED, CriticalSearch
 from testbench.campaign.records import Outcome, Point, RunRow, Wanted
 from testbench.campaign.statistics.shares import Tally, wilson
 from tests.testbench.campaign.worlds import Logistic, failing, play, row, searched
@@ -46,22 +46,6 @@ def test_values_are_written_as_the_scenario_file_says_them() -> None:
     ]
     hundreds = CriticalSearch("n", Decimal("0"), Decimal("1e3"), Decimal("100"), "")
     assert [hundreds.text(index) for index in (0, 1, 10)] == ["0", "100", "1000"]
-
-
-@pytest.mark.parametrize(
-    ("text", "number", "unit"),
-    [("0.05 s", "0.05", "s"), ("-3deg", "-3", "deg"), ("1e-3 N m", "0.001", "N m"), ("7", "7", "")],
-)
-def test_a_quantity_is_its_number_as_written_and_its_unit(text: str, number: str, unit: str) -> None:
-    """No rounding through a float."""
-    assert split_quantity(text) == (Decimal(number), unit)
-
-
-@pytest.mark.parametrize("text", ["", "s", "NaN s", "inf", ",5 s", "1,5"])
-def test_what_is_no_quantity_is_refused(text: str) -> None:
-    """With an example."""
-    with pytest.raises(ValueError, match=r"0\.05 s"):
-        split_quantity(text)
 
 
 @pytest.mark.parametrize(
