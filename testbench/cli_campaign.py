@@ -193,7 +193,9 @@ def _rigging(options: argparse.Namespace) -> "Rigging | None":
     return Rigging(named_buses(options), without, options.fifo, listen, options.control or "")
 
 
-def _executor(options: argparse.Namespace, campaign: "Campaign", rigging: "Rigging | None", jobs: int) -> "Executor":
+def _executor(
+    options: argparse.Namespace, campaign: "Campaign", rigging: "Rigging | None", jobs: int
+) -> "Executor":
     """Where the runs are made. Raises BenchError and FaultError for runs that cannot be made there."""
     if rigging is not None:
         from testbench.campaign.making.over_bus import OverBus, check_scenario

@@ -40,9 +40,9 @@ def interval_note(rule: Rule) -> str:
     if not isinstance(rule, Until):
         return ""
     return (
-        "The runs of a point end when its interval is narrow enough, which is asked after every batch: these intervals "
-        "cover less often than 95 % (95.2 % on average and 90.5 % at worst, computed for batches of 20, at most 400 "
-        "runs and a width of 0.1; docs/statistics.md)."
+        "The runs of a point end when its interval is narrow enough, which is asked after every batch: for some shares "
+        "these intervals cover less often than 95 % (at worst 90.5 %, on average 95.2 %, computed for batches of 20, at "
+        "most 400 runs and a width of 0.1; docs/statistics.md)."
     )
 
 

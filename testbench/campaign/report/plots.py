@@ -5,7 +5,7 @@ units beside the same paper's numbers; where there are too many, all are taken t
 """
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -34,7 +34,7 @@ from testbench.campaign.report.measured import (
 from testbench.campaign.report.meta import Meta
 from testbench.campaign.report.tables import Table, number
 from testbench.campaign.statistics.fits import QuadraticFit, quadratic_fit
-from testbench.campaign.statistics.samples import Summary, mean_interval, summary
+from testbench.campaign.statistics.samples import Summary, mean_interval, median_interval, summary
 from testbench.campaign.statistics.shares import Interval, NotEstimableError, wilson
 from testbench.campaign.words import interval_note
 
@@ -181,26 +181,36 @@ def panel_title(panel: Panel) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Described:
-    """The values of y at one x. mean: interval of the mean, None for one value, for equal ones, for dependent runs."""
+    """The values of y at one x.
+
+    mean, median: their intervals, None for too few values, for equal ones, for dependent runs.
+    """
 
     x: float
     values: Summary
     mean: Interval | None
+    median: Interval | None
 
 
 def described_columns(panel: Panel) -> list[Described]:
     """What is said about the values at every x with runs that have one."""
     found = ((x, values_of(rows, panel.wanted.y)) for x, rows in panel.columns)
     return [
-        Described(x, summary(values), None if panel.together else _mean_interval(values))
+        Described(
+            x,
+            summary(values),
+            None if panel.together else _interval(mean_interval, values),
+            None if panel.together else _interval(median_interval, values),
+        )
         for x, values in found
         if values
     ]
 
 
-def _mean_interval(values: Sequence[float]) -> Interval | None:
+def _interval(of: Callable[[Sequence[float]], Interval], values: Sequence[float]) -> Interval | None:
+    """None where there is none; equal values, whose spread of 0 would claim a number without doubt, have none."""
     try:
-        return mean_interval(values)
+        return of(values) if min(values) < max(values) else None
     except NotEstimableError:
         return None
 
@@ -232,24 +242,27 @@ def fits_of(panel: Panel) -> Fits | None:
 
 def values_section(rows: Sequence[RunRow], meta: Meta) -> Html | None:
     """A table of each figure's numbers, the paper's beside ours; None when no figure shows a metric."""
-    tables = [table(one.caption, one.heads, one.body, one.texts) for one in values_tables(rows, meta)]
+    found = values_tables(rows, meta, medians=True)
+    tables = [table(one.caption, one.heads, one.body, one.texts) for one in found]
     if not tables:
         return None
     note = (
-        "Mean with its 95 % interval (Student's t); quartiles: a quarter of the runs below the first, a quarter above "
-        "the second. Behind a published number stands whether it is inside the interval of our mean, below or above it."
+        "Mean with its 95 % interval (Student's t), median with its own (between order statistics, from six runs up): "
+        "where a few runs lie far above all others, the interval of the mean is too narrow on their side, that of the "
+        "median holds. Quartiles: a quarter of the runs below the first, a quarter above the second. Behind a "
+        "published number stands whether it is inside the interval of our mean, below or above it."
     )
     heading = tag("h2", "Numbers of the figures")
     return tag("section", heading, *tables, tag("p", note, class_="note"), id="values")
 
 
-def values_tables(rows: Sequence[RunRow], meta: Meta) -> list[Table]:
-    """One for each figure that shows a metric."""
+def values_tables(rows: Sequence[RunRow], meta: Meta, medians: bool = False) -> list[Table]:
+    """One for each figure that shows a metric. medians: with their intervals."""
     shown = [panel for panel in panels(rows, meta) if not is_share(panel.wanted.y)]
-    return [_values_table(panel, described) for panel in shown if (described := described_columns(panel))]
+    return [_values_table(panel, described, medians) for panel in shown if (described := described_columns(panel))]
 
 
-def _values_table(panel: Panel, described: Sequence[Described]) -> Table:
+def _values_table(panel: Panel, described: Sequence[Described], medians: bool) -> Table:
     paper = dict(panel.wanted.paper)
     heads = [panel.x_label, "runs", "mean", "median", "quartiles", "lowest", "highest"]
     body = []
@@ -259,7 +272,7 @@ def _values_table(panel: Panel, described: Sequence[Described]) -> Table:
             f"{one.x:g}",
             str(found.n),
             f"{number(found.mean)}{_ends(one.mean)}",
-            number(found.median),
+            f"{number(found.median)}{_ends(one.median) if medians else ''}",
             f"{number(found.q1)}, {number(found.q3)}",
             number(found.low),
             number(found.high),

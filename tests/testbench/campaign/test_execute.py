@@ -34,8 +34,7 @@ def test_a_row_says_what_the_document_of_the_single_run_says(workshop: Workshop)
     assert row.failures_at_3deg == len(document["failures_at_3deg"])
     keys = ("injector", "index", "start_s", "end_s", "duration_s", "frames", "signal", "cause")
     assert [{key: getattr(one, key) for key in keys} for one in row.injections] == [
-        {key: one[key] for key in keys}
-        for one in document["injections"]  # type: ignore[literal-required]
+        {key: one[key] for key in keys} for one in document["injections"]  # type: ignore[literal-required]
     ]
     assert row.outcome is Outcome.FAILURE_SILENT
     assert document["outcome"] == "failure"

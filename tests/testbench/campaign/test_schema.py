@@ -3,6 +3,7 @@
 In the table the sign § stands before the character that the complaint must point at; it is not part of the file.
 """
 
+from decimal import Decimal
 from pathlib import Path
 
 import pytest
