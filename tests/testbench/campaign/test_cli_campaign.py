@@ -322,6 +322,7 @@ def worker_numbers(folder: Path) -> list[int]:
     return [int(path.stem) for path in folder.glob("*.pid")]
 
 
+@pytest.mark.long
 def test_ctrl_c_keeps_what_was_made_and_leaves_nobody(tmp_path: Path) -> None:
     """Exit 130, a line that says how to go on, every row that was made; the second one drops runs in flight."""
     store, path = tmp_path / "s.sqlite", written(tmp_path, ("runs: 3", "runs: 6"))
@@ -347,6 +348,7 @@ def test_ctrl_c_keeps_what_was_made_and_leaves_nobody(tmp_path: Path) -> None:
     assert "12 of 12 runs; 9 made" in out
 
 
+@pytest.mark.long
 def test_workers_leave_when_the_runner_is_killed(tmp_path: Path) -> None:
     """kill -9: the workers end by themselves in the middle of their runs, the lock is free, the rows are there."""
     store, path = tmp_path / "s.sqlite", written(tmp_path, ("runs: 3", "runs: 6"))

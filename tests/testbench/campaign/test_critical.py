@@ -134,6 +134,7 @@ def test_bisection_closes_in_on_a_step() -> None:
         assert result.text == f"{result.value:.3f} s (0.730 s to 0.740 s)"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("quantile", [0.5, 0.2])
 @pytest.mark.parametrize("method", METHODS)
 def test_the_interval_holds_the_true_value(method: str, quantile: float) -> None:
@@ -299,6 +300,7 @@ def test_a_map_has_one_search_for_each_combination_of_the_other_axes() -> None:
     assert holds(late, 2.1)
 
 
+@pytest.mark.long
 def test_no_more_values_are_tried_than_the_promise_allows_for() -> None:
     """Each value tried has its part of the probability of error."""
     search = replace(SEARCH, tolerance=Decimal("0.01"), most=400, batch=1, confidence=0.5)  # decides soon, and wrongly
