@@ -41,8 +41,8 @@ def interval_note(rule: Rule) -> str:
         return ""
     return (
         "The runs of a point end when its interval is narrow enough, which is asked after every batch: for some shares "
-        "these intervals cover less often than 95 % (at worst 90.5 %, on average 95.2 %, computed for batches of 20, at "
-        "most 400 runs and a width of 0.1; docs/statistics.md)."
+        "these intervals cover less often than 95 % (at worst 90.5 %, on average 95.2 %, computed for batches of 20, "
+        "at most 400 runs and a width of 0.1; docs/statistics.md)."
     )
 
 

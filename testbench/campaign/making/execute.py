@@ -263,6 +263,4 @@ def write_kept(spec: RunSpec, result: Result) -> None:
     try:
         write_folder(Path(spec.folder), result)
     except BenchError as error:
-        raise FolderError(
-            f"traces: {spec.keep_traces}: {error}; the run is made again when the same command goes on"
-        ) from error
+        raise FolderError(str(error)) from error

@@ -51,7 +51,7 @@ def no_folder() -> MakeRun:
     """The result folder of every run cannot be written."""
 
     def make(spec: RunSpec) -> RunRow:
-        raise FolderError("traces: always: result folder there: cannot be written")
+        raise FolderError("result folder there: cannot be written")
 
     return make
 

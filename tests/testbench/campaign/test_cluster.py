@@ -123,7 +123,7 @@ def test_hang_of_an_earlier_campaign_is_none_of_this_one(address: str) -> None:
 
 @pytest.mark.run
 def test_result_folder_that_cannot_be_written_there_ends_the_campaign(address: str) -> None:
-    with pytest.raises(ExecutorError, match="worker's machine: traces: always: result folder there: cannot be written"):
+    with pytest.raises(ExecutorError, match="worker's machine: result folder there: cannot be written"):
         rows_of(Cluster(address, f"{MAKERS}:no_folder"), [replace(spec("golden"), identity="full")])
 
 

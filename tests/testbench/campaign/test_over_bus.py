@@ -89,7 +89,7 @@ def test_result_folder_that_cannot_be_written_is_no_try_that_proves_nothing(monk
 
     def full(setup: Setup, **_: object) -> RealTimeRun:
         tried.append(setup)
-        raise FolderError("traces: always: result folder there: cannot be written")
+        raise FolderError("result folder there: cannot be written")
 
     monkeypatch.setattr(over_bus, "run_once", full)
     with pytest.raises(FolderError, match="cannot be written"):
