@@ -94,7 +94,7 @@ soak: $(READY) ## ten million frames through the gateway, then a full bus: none 
 paper: $(READY) ## the campaigns of docs/paper.md, and its tables from them: an hour or two; goes on where it was
 	@run() { echo "campaign run $$*"; $(BIN)/exo-hil campaign run "$$@" || [ $$? = 3 ]; }; to=results/campaigns; set -e; \
 	run campaigns/rmse_over_duration.yaml --out $$to/rmse_over_duration.sqlite; \
-	run campaigns/rmse_over_duration.yaml --out $$to/rmse_over_duration-pins.sqlite --set rig.stops=on; \
+	run campaigns/rmse_over_duration.yaml --out $$to/rmse_over_duration-pins.sqlite --set rig.stops=on --runs 10; \
 	run campaigns/compensated.yaml --out $$to/compensated.sqlite; \
 	run campaigns/compensated.yaml --out $$to/compensated-pins.sqlite --set rig.stops=on; \
 	run campaigns/critical_duration.yaml --out $$to/critical_duration.sqlite; \

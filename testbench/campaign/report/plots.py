@@ -242,7 +242,7 @@ def fits_of(panel: Panel) -> Fits | None:
 
 def values_section(rows: Sequence[RunRow], meta: Meta) -> Html | None:
     """A table of each figure's numbers, the paper's beside ours; None when no figure shows a metric."""
-    found = values_tables(rows, meta, medians=True)
+    found = values_tables(rows, meta)
     tables = [table(one.caption, one.heads, one.body, one.texts) for one in found]
     if not tables:
         return None
@@ -256,13 +256,13 @@ def values_section(rows: Sequence[RunRow], meta: Meta) -> Html | None:
     return tag("section", heading, *tables, tag("p", note, class_="note"), id="values")
 
 
-def values_tables(rows: Sequence[RunRow], meta: Meta, medians: bool = False) -> list[Table]:
-    """One for each figure that shows a metric. medians: with their intervals."""
+def values_tables(rows: Sequence[RunRow], meta: Meta) -> list[Table]:
+    """One for each figure that shows a metric."""
     shown = [panel for panel in panels(rows, meta) if not is_share(panel.wanted.y)]
-    return [_values_table(panel, described, medians) for panel in shown if (described := described_columns(panel))]
+    return [_values_table(panel, described) for panel in shown if (described := described_columns(panel))]
 
 
-def _values_table(panel: Panel, described: Sequence[Described], medians: bool) -> Table:
+def _values_table(panel: Panel, described: Sequence[Described]) -> Table:
     paper = dict(panel.wanted.paper)
     heads = [panel.x_label, "runs", "mean", "median", "quartiles", "lowest", "highest"]
     body = []
@@ -272,7 +272,7 @@ def _values_table(panel: Panel, described: Sequence[Described], medians: bool) -
             f"{one.x:g}",
             str(found.n),
             f"{number(found.mean)}{_ends(one.mean)}",
-            f"{number(found.median)}{_ends(one.median) if medians else ''}",
+            f"{number(found.median)}{_ends(one.median)}",
             f"{number(found.q1)}, {number(found.q3)}",
             number(found.low),
             number(found.high),

@@ -1,6 +1,8 @@
 """docs/paper.md: its campaigns are the paper's, its tables come from stores, and lines of them come out again."""
 
+import itertools
 import re
+import shlex
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -19,6 +21,8 @@ DOCUMENT = (ROOT / "docs" / "paper.md").read_text(encoding="utf-8")
 RECIPE = (ROOT / "Makefile").read_text(encoding="utf-8")
 FILES = sorted((ROOT / "campaigns").glob("*.yaml"))
 BLOCK = re.compile(r"<!-- campaign results/campaigns/(\S+)\.sqlite: ([^>]*?) -->\n(.*?)<!-- end -->", re.DOTALL)
+
+NOT_RUN = "Not run yet: `make paper`.\n"
 
 
 def blocks() -> Iterator[tuple[str, str, str]]:
@@ -43,6 +47,30 @@ def test_every_campaign_of_the_paper_can_be_run() -> None:
     assert len(durations) == len(set(durations)) == 20
     assert {"0.05 s", "0.5 s", "0.75 s", "3 s"} <= set(durations)
     assert campaigns["rmse_over_duration"].rule == FixedRuns(30)
+
+
+def recipe_of(store: str) -> tuple[str, list[str], int | None]:
+    """(file, changes of the scenario, runs a point); of the file unless the recipe has `--runs`, None for a search."""
+    (line,) = re.findall(rf"run (campaigns/\S+ --out \$\$to/{re.escape(store)}\.sqlite[^;\n]*)", RECIPE)
+    words = shlex.split(line)
+    options = list(itertools.pairwise(words[1:]))
+    rule, asked = load_campaign(ROOT / words[0]).rule, [int(value) for key, value in options if key == "--runs"]
+    runs = asked[0] if asked else rule.runs if isinstance(rule, FixedRuns) else None
+    return words[0], [value for key, value in options if key == "--set"], runs
+
+
+def test_every_table_is_of_all_runs_that_the_recipe_asks_for() -> None:
+    """The document shows what `make paper` makes, whole, or says that it was not run."""
+    for store, what, text in blocks():
+        if text == NOT_RUN:
+            continue
+        _, _, runs = recipe_of(store)
+        if what == "run":
+            assert f", {runs} runs a point, seeds 1 to {runs};" in text
+        elif runs is not None:
+            lines = [line.split("|") for line in text.splitlines() if line.startswith("|")]
+            place = [cell.strip() for cell in lines[0]].index("runs")
+            assert {line[place].strip() for line in lines[2:]} == {str(runs)}
 
 
 def about(campaign: Campaign, points: tuple[Point, ...]) -> Meta:
@@ -71,17 +99,20 @@ def made_again(campaign: Campaign, point: Point, runs: int) -> list[RunRow]:
 
 @pytest.mark.run
 @pytest.mark.parametrize(
-    ("file", "value", "what"),
-    [("rmse_over_duration", "0.05 s", "values 1"), ("bit_flips", "17", "outcomes")],
+    ("store", "value", "what"),
+    [("rmse_over_duration-pins", "0.05 s", "values 1"), ("bit_flips", "17", "outcomes")],
 )
-def test_line_of_the_document_comes_out_again(file: str, value: str, what: str) -> None:
+def test_line_of_the_document_comes_out_again(store: str, value: str, what: str) -> None:
     """Same seeds, same numbers: the runs of one point, made anew, give the line that stands in the document."""
-    campaign = load_campaign(ROOT / "campaigns" / f"{file}.yaml")
+    path, changes, runs = recipe_of(store)
+    campaign = load_campaign(ROOT / path, changes)
     (point,) = (point for point in campaign.points if point.parameters[0][1] == value)
-    (table,) = (text for store, words, text in blocks() if (store, words) == (file, what))
+    (table,) = (text for name, words, text in blocks() if (name, words) == (store, what))
     number = value.split()[0] if what.startswith("values") else value  # these tables have the unit in the head
     written = _cells(table, number)
-    rows = made_again(campaign, point, int(written["runs"]))
+    assert runs is not None
+    assert int(written["runs"]) == runs
+    rows = made_again(campaign, point, runs)
     again = _cells(table_of(rows, about(campaign, (point,)), what), number)
     others = written.keys() - again.keys()  # outcomes that other points show
     assert {head: written[head] for head in again} == again
