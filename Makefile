@@ -68,11 +68,11 @@ lint: $(READY) ## ruff, mypy --strict, import contracts
 	$(BIN)/python -m mypy
 	$(BIN)/lint-imports --no-logo
 
-unit: $(READY) ## the tests that need no whole run and no clock, on WORKERS=2 processes: half a minute
-	$(PYTEST) -n $(WORKERS) -m "not run and not realtime" --ignore=tests/vcan --junitxml=$(REPORTS)/$@.xml
+unit: $(READY) ## the tests that need no whole run and no clock, on WORKERS=2 processes: a minute
+	$(PYTEST) -n $(WORKERS) -m "not run and not long and not realtime" --ignore=tests/vcan --junitxml=$(REPORTS)/$@.xml
 
-runs: $(READY) ## whole scenario runs in virtual time, and the examples, on WORKERS=2 processes
-	$(PYTEST) -n $(WORKERS) -m run --ignore=tests/vcan --junitxml=$(REPORTS)/$@.xml
+runs: $(READY) ## whole runs in virtual time, the examples, and laws that take long, on WORKERS=2 processes
+	$(PYTEST) -n $(WORKERS) -m "run or long" --ignore=tests/vcan --junitxml=$(REPORTS)/$@.xml
 
 realtime: $(READY) ## rigs of processes against the clock, one at a time, on the hub; a machine too busy for them skips
 	$(PYTEST) -m realtime --ignore=tests/vcan --junitxml=$(REPORTS)/$@.xml

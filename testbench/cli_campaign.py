@@ -27,6 +27,9 @@ if TYPE_CHECKING:
     from testbench.process import Orders
 
 INTERRUPTED: Final = 130
+_RETRY: Final = (
+    "make runs that crashed or hung once more, with --realtime invalid ones too (they may come out otherwise)"
+)
 
 
 def add_campaign_verbs(verbs: Verbs, show: Callable[[str], None]) -> None:
@@ -48,7 +51,7 @@ def add_campaign_verbs(verbs: Verbs, show: Callable[[str], None]) -> None:
         help="change the scenario of every run, as for `exo-hil run`; may be repeated",
     )
     run.add_argument("--no-fork", action="store_true", help="every run from power-up, not from the golden run's middle")
-    run.add_argument("--retry", action="store_true", help="make runs that crashed or hung once more")
+    run.add_argument("--retry", action="store_true", help=_RETRY)
     run.add_argument("--no-report", action="store_true", help="write no report at the end")
     run.add_argument("--cluster", metavar="ADDRESS", help="on the workers of dask.distributed, as in tcp://HOST:8786")
     run.add_argument("--realtime", action="store_true", help="one after another as processes against the clock")
@@ -154,13 +157,14 @@ def _run(options: argparse.Namespace, show: Callable[[str], None]) -> int:
     try:
         remember(store, campaign)
         if options.retry:
-            store.runs.forget((Outcome.CRASHED, Outcome.HANG), version)
+            again = (Outcome.CRASHED, Outcome.HANG, *([] if rigging is None else [Outcome.INVALID]))
+            store.runs.forget(again, version)
         runner = Runner(campaign, store, way)
         with Orders().taken() as orders, shown(campaign.name) as watch:
             runner.prepare()
             finished = runner.run(executor, watch, _stopping(orders))
         rows = store.runs.all(brief=True)
-        show(_run_json(campaign, store, rows, finished) if options.json else _run_text(store, rows, finished))
+        show(_run_json(campaign, store, rows, finished) if options.json else _run_text(campaign, store, rows, finished))
         if finished.interrupted:
             _say(f"interrupted; the same command goes on from here: {len(rows)} runs are in {path}")
             return INTERRUPTED
@@ -240,12 +244,13 @@ def _command() -> str:
     return shlex.join(["exo-hil", *sys.argv[1:]])
 
 
-def _run_text(store: "Store", rows: "list[RunRow]", finished: "Finished") -> str:
+def _run_text(campaign: "Campaign", store: "Store", rows: "list[RunRow]", finished: "Finished") -> str:
     """What `campaign run` prints at its end."""
-    from testbench.campaign.words import point_lines, time_text
+    from testbench.campaign.words import interval_note, point_lines, time_text
 
     far = finished.progress
     lines = point_lines(store.points.all(), rows)
+    lines += [note] if (note := interval_note(campaign.rule)) else []
     rate = f"{far.per_minute:.1f} runs/min" if far.made else "nothing was missing"
     lines.append(f"{far.done} of {far.wanted} runs; {far.made} made in {time_text(far.elapsed_s)} ({rate})")
     return "\n".join([*lines, *_asides(store, rows), f"store: {store.path}"]) + "\n"

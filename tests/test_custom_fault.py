@@ -68,6 +68,7 @@ def test_the_scenario_is_said_in_words(tmp_path: Path) -> None:
     assert "position of right_knee (0x185, to_controller) known only in steps of 3 deg for 0.5 s" in done.stdout
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
@@ -105,6 +106,7 @@ def test_the_scenario_runs(tmp_path: Path) -> None:
     assert hashes[0]["golden"] != hashes[0]["faulted"]
 
 
+@pytest.mark.long
 def test_an_installed_package_is_found_by_its_short_name(tmp_path: Path) -> None:
     """Entry point in the group exo_hil.faults: check, list of types in messages, and JSON Schema."""
     place = tmp_path / "place"

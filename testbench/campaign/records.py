@@ -46,6 +46,9 @@ NO_STATEMENT: Final = frozenset({Outcome.HANG, Outcome.INVALID, Outcome.CRASHED}
 """Counted apart, never among the runs of which a share is taken."""
 
 
+UNITS: Final = (("_rad_s", "rad/s"), ("_rad", "rad"), ("_nm", "N m"), ("_deg", "deg"), ("_rpm", "rpm"), ("_s", "s"))
+"""How the name of a number ends, and the unit it then has."""
+
 IN_REAL_TIME: Final = "in real time"
 """In the code version of runs that were made against the clock: no run in virtual time stands for one of them."""
 

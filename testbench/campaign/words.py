@@ -35,6 +35,17 @@ def asked(rule: Rule) -> str:
     )
 
 
+def interval_note(rule: Rule) -> str:
+    """What has to be said beside the intervals of shares, "" for nothing: with `until` they are asked repeatedly."""
+    if not isinstance(rule, Until):
+        return ""
+    return (
+        "The runs of a point end when its interval is narrow enough, which is asked after every batch: for some shares "
+        "these intervals cover less often than 95 % (at worst 90.5 %, on average 95.2 %, computed for batches of 20, "
+        "at most 400 runs and a width of 0.1; docs/statistics.md)."
+    )
+
+
 def describe_campaign(campaign: Campaign) -> list[str]:
     """The campaign in sentences, for `exo-hil check`."""
     about = f": {campaign.description}" if campaign.description else ""
@@ -67,7 +78,8 @@ def point_lines(points: Mapping[int, Point], rows: Sequence[RunRow], outcome: st
     for number, point in shown[:SHOWN]:
         found, texts = by_point[point], dict(point.parameters)
         counts = [str(sum(row.outcome is one for row in found)) for one in outcomes]
-        share = share_text([row.outcome for row in found], outcome)
+        counted = tally((row.outcome for row in found), outcome)
+        share = share_text(counted.successes, counted.trials)
         table.append([str(number), *(texts.get(axis, "") for axis in axes), str(len(found)), *counts, share])
     widths = [max(len(line[column]) for line in table) for column in range(len(table[0]))]
     lines = ["  ".join(text.ljust(width) for text, width in zip(line, widths, strict=True)).rstrip() for line in table]
@@ -76,14 +88,12 @@ def point_lines(points: Mapping[int, Point], rows: Sequence[RunRow], outcome: st
     return lines
 
 
-def share_text(outcomes: Sequence[Outcome], name: str) -> str:
-    """ "20 % (6 to 51 %)" of the runs that make a statement; "-" without any."""
-    counted = tally(outcomes, name)
-    if not counted.trials:
-        return "-"
-    interval = wilson(counted.successes, counted.trials)
-    share = 100 * counted.successes / counted.trials
-    return f"{share:.0f} % ({100 * interval.low:.0f} to {100 * interval.high:.0f} %)"
+def share_text(part: int, whole: int) -> str:
+    """`12.0 % (4.2 to 28.1 %)`: a share with its Wilson interval; none where there is nothing to take a share of."""
+    if not whole:
+        return "none"
+    interval = wilson(part, whole)
+    return f"{_percent(part / whole)} % ({_percent(interval.low)} to {_percent(interval.high)} %)"
 
 
 def counts_text(counts: Mapping[Outcome, int]) -> str:
@@ -122,6 +132,10 @@ def _runs(rule: Rule, points: int) -> str:
     if isinstance(rule, Until):
         return f"{points * max(rule.least, rule.batch)} to {points * rule.most}"
     return f"at most {points * rule.most}" if isinstance(rule, CriticalSearch) else "as the search finds out"
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.0f}" if share in (0, 1) else f"{100 * share:.1f}"
 
 
 def _s(count: int) -> str:

@@ -21,6 +21,7 @@ def test_all_types_are_in_these_lists() -> None:
         assert set(kinds.built_in) == {text.removeprefix("{type: ").split(",")[0].rstrip("}") for text in texts}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("target", "fault"), FAULT_TEXTS)
 @settings(max_examples=3, deadline=None)
 @given(

@@ -194,6 +194,7 @@ def lengths(effect: EffectSpec, period_s: float, seed: int) -> list[float]:
     return [one // period for one in drawn]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", EVENTS)
 def test_an_event_has_the_distribution_it_is_named_after(name: str) -> None:
     """Each event distribution is the one named; the grid of those that count periods goes on after expiry."""
@@ -204,6 +205,7 @@ def test_an_event_has_the_distribution_it_is_named_after(name: str) -> None:
     assert rejections(drawn.__getitem__, law.wrong, law.period_s > 0) > ALLOWED
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", EFFECTS)
 def test_an_effect_has_the_distribution_it_is_named_after(name: str) -> None:
     """Each effect distribution is the one named."""
@@ -214,6 +216,7 @@ def test_an_effect_has_the_distribution_it_is_named_after(name: str) -> None:
     assert rejections(drawn.__getitem__, law.wrong, law.period_s > 0) > ALLOWED
 
 
+@pytest.mark.long
 def test_every_frame_has_its_own_trial() -> None:
     """failure_probability per frame: the number of frames to the next one is geometric, whatever their times."""
     law = spec(FailureProbabilitySpec, "{type: failure_probability, p: 20 %, per: frame}")

@@ -732,6 +732,7 @@ frames = st.one_of(
 )
 
 
+@pytest.mark.long
 @settings(max_examples=200, deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 3 * MS), st.sampled_from([0, 1]), frames), max_size=60))
 def test_no_frame_makes_the_gateway_raise(traffic: list[tuple[int, int, Frame]]) -> None:

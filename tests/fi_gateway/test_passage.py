@@ -366,6 +366,7 @@ def served(bench: Bench, traffic: list[tuple[int, int, int, bytes]], start: int 
         bench.give(now, Frame(can_id, data), port)
 
 
+@pytest.mark.long
 @settings(deadline=None)
 @given(TRAFFIC, st.lists(st.integers(0, 7), max_size=5))
 def test_no_frame_gets_lost_or_made_without_being_counted(
@@ -387,6 +388,7 @@ def test_no_frame_gets_lost_or_made_without_being_counted(
         assert one.injected == sum(record.frames_injected for record in records)
 
 
+@pytest.mark.long
 @settings(deadline=None)
 @given(TRAFFIC, st.lists(st.integers(0, 7), max_size=5))
 def test_frames_that_are_no_target_pass_at_once_in_order(
@@ -403,6 +405,7 @@ def test_frames_that_are_no_target_pass_at_once_in_order(
     assert [row for row in bench.sink.sent if row[2].can_id not in (0x181, 0x182)] == given_frames
 
 
+@pytest.mark.long
 @settings(deadline=None)
 @given(TRAFFIC, st.lists(st.integers(0, 7), min_size=1, max_size=5))
 def test_after_the_windows_nothing_is_left(traffic: list[tuple[int, int, int, bytes]], kinds: list[int]) -> None:
@@ -418,6 +421,7 @@ def test_after_the_windows_nothing_is_left(traffic: list[tuple[int, int, int, by
     assert bench.sink.sent == plain.sink.sent
 
 
+@pytest.mark.long
 @settings(deadline=None)
 @given(TRAFFIC, st.lists(st.integers(0, 7), max_size=4), st.integers(0, 40))
 def test_a_copy_in_mid_run_goes_on_as_the_original(
@@ -448,6 +452,7 @@ def test_a_gateway_with_frames_that_wait_can_be_pickled() -> None:
     assert twin.came() == [(190, b"\x09")]
 
 
+@pytest.mark.long
 @settings(deadline=None)
 @given(TRAFFIC, st.permutations([0, 1, 2]))
 def test_the_order_of_independent_injectors_does_not_matter(

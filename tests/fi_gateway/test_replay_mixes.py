@@ -4,6 +4,7 @@ import random
 import struct
 from typing import Final
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -142,6 +143,7 @@ def walk(gateway: Gateway, seed: int) -> Sink:
     return sink
 
 
+@pytest.mark.long
 @settings(max_examples=150, deadline=None)
 @given(mixes(), st.integers(0, 1000))
 def test_a_replay_sends_the_same_frames_at_the_same_times(text: str, seed: int) -> None:

@@ -26,6 +26,7 @@ def windows_of(bench: Bench) -> dict[str, tuple[Window, ...]]:
     return found
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("target", "fault"), FAULT_TEXTS)
 @settings(max_examples=4, deadline=None)
 @given(event=st.sampled_from(EVENT_TEXTS), effect=st.sampled_from(EFFECT_TEXTS), seed=st.integers(0, 1000))

@@ -395,6 +395,7 @@ def test_no_frame_is_lost_doubled_or_moved_in_a_long_stream(bench: MakeBench) ->
 # ---- the soak recipe ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_the_soak_recipe_runs() -> None:
     """`make soak` in small: a gateway in a process of its own, 50 000 frames, every record compared with its due."""
     command = [sys.executable, "-m", "benchmarks.soak", "--frames", "50000", "--seconds", "0"]

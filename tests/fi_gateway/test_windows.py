@@ -289,6 +289,7 @@ def test_delayed_triggers_queue_and_those_that_find_it_open_are_ignored() -> Non
     assert [one.start_ns for one in gateway.records if one.injector == "b"] == [200, 260]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("probability", "right"), [(0.0, True), (0.3, True), (1.0, True), (0.3, False)])
 def test_a_trigger_fires_with_its_probability(probability: float, right: bool) -> None:
     """Binomial, per rise, over seeds 0..19 at 1 %: at most 2 rejections; 0.3 is not 0.25, and the same test says so."""
@@ -357,6 +358,7 @@ def test_arming_finds_a_level_that_holds_already() -> None:
     assert opened(gateway)[1:] == [("b", 150, "trigger:a")]
 
 
+@pytest.mark.long
 def test_a_copy_keeps_what_triggers_have_heard() -> None:
     """Snapshots: delays that run, levels that hold, rises that were seen."""
     injectors = [

@@ -387,6 +387,7 @@ def test_a_requirement_without_an_id_ends_the_run(pytester: pytest.Pytester, mar
 # ---- pytest-xdist ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_reports_and_properties_come_through_xdist(pytester: pytest.Pytester) -> None:
     """Sections and properties travel from the worker."""
     pytester.makepyfile(FAILING + "\ndef test_passes(exo):\n    exo.run_for('10 ms')\n")
@@ -398,6 +399,7 @@ def test_reports_and_properties_come_through_xdist(pytester: pytest.Pytester) ->
     assert [key for key, _ in found] == ["requirement", "exo_candump_log", "exo_candump_log"]
 
 
+@pytest.mark.long
 def test_a_named_bus_holds_one_rig_at_a_time(pytester: pytest.Pytester) -> None:
     """Two rigs on one interface would answer each other."""
     pytester.makepyfile("def test_one(exo): pass\ndef test_other(): pass")

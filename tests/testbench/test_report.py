@@ -37,6 +37,7 @@ def failed(run_maker: RunMaker, activation_maker: ActivationMaker) -> Plotted:
     return shown(run_maker(), run_maker(bump_rad=2.0, activations=hit))
 
 
+@pytest.mark.long
 def test_both_plots_are_written_as_png(tmp_path: Path, failed: Plotted) -> None:
     """Design: plots as PNG in the result folder; an image that opens, large enough to read."""
     files = plot_files(failed)
@@ -50,6 +51,7 @@ def test_both_plots_are_written_as_png(tmp_path: Path, failed: Plotted) -> None:
             assert np.asarray(image.convert("L")).std() > 10  # not an empty sheet
 
 
+@pytest.mark.long
 def test_same_run_gives_the_same_bytes(tmp_path: Path, failed: Plotted) -> None:
     """Reproducible down to the picture."""
     for name in ("a.png", "b.png"):
@@ -186,6 +188,7 @@ def test_joint_at_fault_is_that_of_the_first_signal_hit(run_maker: RunMaker, act
     assert joint_at_fault(shown(run_maker(), run_maker(bump_rad=1.0))) == "right_knee"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("title", ["a $x^ b", "with_$\\bad{", "long " * 80, "Knie, früh"])
 def test_any_title_can_be_drawn(tmp_path: Path, run_maker: RunMaker, title: str) -> None:
     """A scenario's description is text, not a formula, and stays on the sheet."""

@@ -3,17 +3,18 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
+from decimal import Decimal
 from typing import Annotated, Final, Literal
 
 from pydantic import BeforeValidator, Field
 
 from fi_gateway.boundary import Count, Share, SpecModel, Text, Time, validate
 from fi_gateway.marked_yaml import Data, Document, Keys, did_you_mean
-from fi_gateway.quantity import describe_value
+from fi_gateway.quantity import describe_value, format_number
 from testbench.campaign.file.axes import Axis
 from testbench.campaign.file.rules import FAILURE, OUTCOMES, Figure, FixedRuns, Rule, Until
 from testbench.campaign.file.values import common_unit, number_of, text_of
-from testbench.campaign.plans.search import CombinationSearch, CriticalSearch, split_quantity
+from testbench.campaign.plans.search import CombinationSearch, CriticalSearch
 from testbench.campaign.records import RunRow
 from testbench.campaign.statistics.shares import outcomes_named
 from testbench.document import JointEntry
@@ -175,8 +176,8 @@ def _critical(spec: CriticalSpec, axes: Sequence[Axis], document: Document) -> C
         text = f"{spec.axis} has no two numbers to search between; give its ends: between: {{from: ..., to: ...}}"
         document.report((*at, "axis"), text)
         return None
-    _, unit = common_unit((spec.tolerance, ordered[0][1], ordered[-1][1]))
-    low, high, tolerance = (split_quantity(text)[0] for text in (ordered[0][1], ordered[-1][1], spec.tolerance))
+    numbers, unit = common_unit((ordered[0][1], ordered[-1][1], spec.tolerance))
+    low, high, tolerance = (Decimal(format_number(number)) for number in numbers)
     return CriticalSearch(
         axis=spec.axis,
         low=low,

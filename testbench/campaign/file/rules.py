@@ -5,18 +5,12 @@ from typing import Final
 
 from testbench.campaign.plans.search import CombinationSearch, CriticalSearch
 from testbench.campaign.records import NO_STATEMENT, Outcome
-from testbench.campaign.statistics.shares import outcomes_named
 
 FAILURE: Final = "failure"
 """Where a rule, a figure or a share names it: any of the failures."""
 
 OUTCOMES: Final = tuple(outcome.value for outcome in Outcome if outcome not in NO_STATEMENT)
 """What a rule may name."""
-
-
-def counts_as(outcome: Outcome, name: str) -> bool:
-    """Whether a run of that outcome counts for a rule about `name`; raises ValueError for a name that is none."""
-    return outcome in outcomes_named(name)
 
 
 @dataclass(frozen=True, slots=True)

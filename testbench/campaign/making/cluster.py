@@ -112,6 +112,7 @@ class Cluster(Executor):
                 "'dask scheduler --host 127.0.0.1', or name where it is, as in tcp://127.0.0.1:8786"
             ) from error
         try:
+            self._heard_before = self._last_heard()
             self._client.wait_for_workers(1, timeout=WORKERS_S)
             wrong = complaints(self._client.run(code_version, on_error="return"), self._version)
             if wrong:
@@ -165,6 +166,10 @@ class Cluster(Executor):
         self._flying.clear()
         self._client.close()
 
+    def _last_heard(self) -> float:
+        """When a worker last said that a run took too long, by the scheduler's clock: of a campaign before this one."""
+        return max((float(time_s) for time_s, _ in self._client.get_events(HUNG)), default=0.0)
+
     def _no_worker(self) -> ExecutorError:
         return ExecutorError(
             f"--cluster {self._address}: no worker there for {WORKERS_S:g} s; start one on each machine: "
@@ -179,6 +184,8 @@ class Cluster(Executor):
             if isinstance(said, OtherCode):
                 wrong = complaints({said.worker: said.version}, self._version)
                 raise ExecutorError(f"--cluster {self._address}: {wrong[0]}")
+            if said.ends:
+                raise ExecutorError(f"--cluster {self._address}: worker's machine: {said.text}")
             return given_up(spec, Outcome.CRASHED, said.text, 1, 0.0, "")
         if future.status != "error":
             raise ExecutorError(f"--cluster {self._address}: run {spec.identity[:12]} was {future.status} there")
@@ -189,7 +196,7 @@ class Cluster(Executor):
                 "same commit of exo-hil, with its extras, on every worker"
             )
         attempts = error.allowed_failures + 1
-        if spec.identity in {said for _, said in self._client.get_events(HUNG)}:
+        if spec.identity in {said for time_s, said in self._client.get_events(HUNG) if time_s > self._heard_before}:
             reason = f"not finished after {spec.time_limit_s:g} s; its worker ended itself, {attempts} times in a row"
             return given_up(spec, Outcome.HANG, reason, attempts, spec.time_limit_s, "")
         return given_up(spec, Outcome.CRASHED, f"the worker died, {attempts} times in a row", attempts, 0.0, "")

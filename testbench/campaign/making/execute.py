@@ -22,6 +22,7 @@ from hlc.limits import limits_of
 from hlc.node import Phase
 from joint_emulators.errors import JointEmulatorError
 from testbench.campaign.making.early import LOOK_NS, FailureStop
+from testbench.campaign.making.executor import FolderError
 from testbench.campaign.making.fork import Trunk
 from testbench.campaign.making.outcomes import first_reaction, outcome_of, phase_at, severity
 from testbench.campaign.records import FAILURES, InjectionRow, Outcome, RunRow, RunSpec
@@ -30,7 +31,7 @@ from testbench.folder import write_folder
 from testbench.golden import JointComparison
 from testbench.record import RunRecord
 from testbench.rig import Rig, RigParams, build_rig
-from testbench.run import CHUNK_NS, chunks, judge_pair, record_of, result_of, rig_params, uncollected
+from testbench.run import CHUNK_NS, Result, chunks, judge_pair, record_of, result_of, rig_params, uncollected
 from testbench.scenario import Scenario, parse_scenario
 from testbench.summary import versions
 from testbench.verdict import Judgement, limit_failures
@@ -93,7 +94,7 @@ class Made:
 def make_run(spec: RunSpec, workshop: Workshop) -> RunRow:
     """Make one run and judge it. A run that gives nothing to judge comes back as invalid, with the reason.
 
-    Raises FileErrors and FaultError for a scenario that cannot be run, and BenchError when a result folder cannot be
+    Raises FileErrors and FaultError for a scenario that cannot be run, and FolderError when a result folder cannot be
     written. Nothing here holds `time_limit_s`: whoever has started the process does.
     """
     started, wall, cpu = datetime.now(UTC), time.perf_counter(), time.process_time()
@@ -107,8 +108,9 @@ def make_run(spec: RunSpec, workshop: Workshop) -> RunRow:
     else:
         pair = Pair(made.golden.record, made.golden.trace_hash, made.record, made.trace_hash, made.forked_s)
         row = judged(spec, scenario, pair, judgement)
-        if spec.keep_traces == "always" or (spec.keep_traces == "failures" and row.outcome in FAILURES):
-            _keep(Path(spec.folder), scenario, made, time.perf_counter() - wall)
+        if keeps(spec, row.outcome):
+            sim_s, wall_s = made.sim_ns / 1e9, time.perf_counter() - wall  # of the faulted run, golden made before
+            write_kept(spec, result_of(scenario, made.golden.record, made.record, sim_time_s=sim_s, wall_time_s=wall_s))
     return replace(
         row,
         started=started.isoformat(timespec="milliseconds"),
@@ -251,9 +253,14 @@ def _injection(one: Activation, time0_ns: int) -> InjectionRow:
     )
 
 
-def _keep(folder: Path, scenario: Scenario, made: Made, wall_time_s: float) -> None:
-    """The result folder, as `exo-hil run` writes it; its times are of the faulted run, golden made before."""
-    result = result_of(
-        scenario, made.golden.record, made.record, sim_time_s=made.sim_ns / 1e9, wall_time_s=wall_time_s
-    )
-    write_folder(folder, result)
+def keeps(spec: RunSpec, outcome: Outcome) -> bool:
+    """Whether a run of that outcome leaves a result folder."""
+    return spec.keep_traces == "always" or (spec.keep_traces == "failures" and outcome in FAILURES)
+
+
+def write_kept(spec: RunSpec, result: Result) -> None:
+    """The result folder, as `exo-hil run` writes it. Raises FolderError."""
+    try:
+        write_folder(Path(spec.folder), result)
+    except BenchError as error:
+        raise FolderError(str(error)) from error

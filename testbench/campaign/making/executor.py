@@ -15,6 +15,10 @@ class ExecutorError(BenchError):
     """No run can be made at all; the message says why."""
 
 
+class FolderError(ExecutorError):
+    """The result folder of a run cannot be written: the campaign ends, the run is not recorded, and made again."""
+
+
 @mypyc_attr(allow_interpreted_subclasses=True)
 class Executor:
     """Makes runs. Every run that was submitted comes back as one row, also one that crashed or hung."""

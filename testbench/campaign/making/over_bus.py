@@ -13,7 +13,6 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import Final, final
 
 from canopen_exo.bus.node import NEVER
@@ -21,11 +20,10 @@ from canopen_exo.bus.trace import trace_hash
 from fi_gateway.control_socket import ask, ask_listing
 from fi_gateway.errors import FaultError
 from fi_gateway.schema import refuse_wire_faults
-from testbench.campaign.making.execute import Pair, judged
-from testbench.campaign.making.executor import ATTEMPTS, Executor, given_up
-from testbench.campaign.records import FAILURES, IN_REAL_TIME, Outcome, RunRow, RunSpec
+from testbench.campaign.making.execute import Pair, judged, keeps, write_kept
+from testbench.campaign.making.executor import ATTEMPTS, Executor, FolderError, given_up
+from testbench.campaign.records import IN_REAL_TIME, Outcome, RunRow, RunSpec
 from testbench.errors import BenchError
-from testbench.folder import write_folder
 from testbench.realtime_run import RealTimeRun, check_without, limits_in, pair_result, run_once
 from testbench.record import RunRecord
 from testbench.rig import RigParams
@@ -87,7 +85,10 @@ class OverBus(Executor):
         self._waiting.append(spec)
 
     def collect(self, timeout_s: float) -> list[RunRow]:
-        """Make the run that waits, however long it takes; Ctrl-C ends it with KeyboardInterrupt."""
+        """Make the run that waits, however long it takes; Ctrl-C ends it with KeyboardInterrupt.
+
+        Raises FolderError.
+        """
         return [self._row(self._waiting.popleft())] if self._waiting else []
 
     def stop(self) -> None:
@@ -101,6 +102,8 @@ class OverBus(Executor):
             started, wall = datetime.now(UTC).isoformat(timespec="milliseconds"), time.perf_counter()
             try:
                 row = self._made(spec, scenario)
+            except FolderError:
+                raise  # not of the run: nobody may take it for one that proves nothing
             except (BenchError, FaultError) as error:
                 row = given_up(spec, Outcome.INVALID, str(error), attempt, 0.0, started)
             row = replace(
@@ -128,8 +131,8 @@ class OverBus(Executor):
         judgement = judge_pair(scenario, golden.record, record)
         pair = Pair(golden.record, trace_hash(golden.record.rows), record, trace_hash(record.rows))
         row = judged(spec, scenario, pair, judgement)
-        if spec.keep_traces == "always" or (spec.keep_traces == "failures" and row.outcome in FAILURES):
-            write_folder(Path(spec.folder), pair_result(scenario, golden, faulted, time.perf_counter() - begun))
+        if keeps(spec, row.outcome):
+            write_kept(spec, pair_result(scenario, golden, faulted, time.perf_counter() - begun))
         timing = faulted.timing
         kept = {"timing.late_cycles": float(len(timing.late)), "timing.worst_late_ms": timing.late_worst_ns / 1e6}
         return replace(row, metrics={**row.metrics, **kept})

@@ -194,6 +194,8 @@ class Pool(Executor):
             self._failed_starts = 0
         elif isinstance(said, RunRow):
             self._finish(task, said)
+        elif isinstance(said, Failed) and said.ends:
+            raise ExecutorError(said.text)
         else:
             text = said.text if isinstance(said, Failed) else f"the process answered {said!r}"
             self._give_up(task, Outcome.CRASHED, text)

@@ -17,6 +17,7 @@ from multiprocessing import parent_process
 from multiprocessing.connection import Connection, wait
 from typing import Final
 
+from testbench.campaign.making.executor import FolderError
 from testbench.campaign.making.identity import code_version
 from testbench.campaign.records import RunRow, RunSpec
 
@@ -34,9 +35,10 @@ LINES: Final = 6
 
 @dataclass(frozen=True, slots=True)
 class Failed:
-    """An exception while a run was made: a defect of the program."""
+    """An exception while a run was made: a defect of the program. ends: not of the run, and it ends the campaign."""
 
     text: str
+    ends: bool = False
 
 
 def run_maker() -> MakeRun:
@@ -58,6 +60,8 @@ def made_or_failed(make: MakeRun, spec: RunSpec) -> RunRow | Failed:
     """The row, or what went wrong: last lines of the traceback in one."""
     try:
         return make(spec)
+    except FolderError as error:
+        return Failed(str(error), ends=True)
     except Exception:  # noqa: BLE001 - the last resort of this process: what it was becomes the reason in the row
         lines = traceback.format_exc().strip().splitlines()
         return Failed(" | ".join(line.strip() for line in lines[-LINES:]))

@@ -1,6 +1,6 @@
 """Plans of a grid: so many runs at every point, or as many as a wanted interval takes."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Final, final
 
 from testbench.campaign.file.rules import FixedRuns, Until
@@ -61,9 +61,3 @@ def _by_block(runs: dict[Point, int]) -> list[Wanted]:
         for point, count in runs.items()
         for number in range(start, min(start + BLOCK, count))
     ]
-
-
-def missing(wanted: Iterable[Wanted], known: Known) -> list[Wanted]:
-    """Those that are not known yet, in their order."""
-    there = {(point, row.number) for point, rows in known.items() for row in rows}
-    return [one for one in wanted if (one.point, one.number) not in there]

@@ -5,7 +5,6 @@ The searches themselves are beside this: `critical` (the value of an axis at whi
 """
 
 import math
-import re
 from dataclasses import dataclass
 from decimal import Decimal
 from fractions import Fraction
@@ -20,18 +19,6 @@ SCANNED: Final = 5
 """Values, from end to end of the axis, of which each gets one batch before the search proper begins."""
 MAX_STEPS: Final = 1_000_000
 """Most values on the grid of a search; 2^20 of them are 20 halvings."""
-
-_QUANTITY: Final = re.compile(
-    r"([+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]{1,2})?)\s*((?:[A-Za-zµμ%/]|1/).*)?", re.ASCII
-)
-
-
-def split_quantity(text: str) -> tuple[Decimal, str]:
-    """Number, exactly as written, and unit ("" for none): "0.05 s" -> (Decimal("0.05"), "s"); raises ValueError."""
-    match = _QUANTITY.fullmatch(text.strip())
-    if match is None:
-        raise ValueError(f"{text!r} is not a number with its unit, such as '0.05 s'")
-    return Decimal(match[1]), match[2] or ""
 
 
 @dataclass(frozen=True, slots=True)

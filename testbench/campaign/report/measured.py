@@ -1,6 +1,6 @@
 """What of a run a report can show over an axis, and which runs count for it."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
@@ -8,7 +8,7 @@ from testbench.campaign.file.axes import Axis
 from testbench.campaign.file.rule_specs import RUN_NUMBERS
 from testbench.campaign.file.rules import OUTCOMES
 from testbench.campaign.plans.search import CombinationSearch, CriticalSearch
-from testbench.campaign.records import FAILURES, NO_STATEMENT, Point, RunRow
+from testbench.campaign.records import FAILURES, NO_STATEMENT, UNITS, Point, RunRow
 from testbench.campaign.report.meta import Meta
 from testbench.campaign.statistics.shares import outcomes_named
 
@@ -28,7 +28,6 @@ _NAMED: Final = {
     "ended_s": ("end of the motion", "s"),
 }
 """Numbers of a run, which belong to no joint."""
-_UNITS: Final = (("_rad_s", "rad/s"), ("_rad", "rad"), ("_nm", "N m"), ("_deg", "deg"), ("_rpm", "rpm"), ("_s", "s"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +50,7 @@ def quantity(name: str) -> Quantity:
         return Quantity(name, *_NAMED[name])
     joint, dot, what = name.rpartition(".")
     unit, words = "", what
-    for ending, found in _UNITS:
+    for ending, found in UNITS:
         if what.endswith(ending):
             unit, words = found, what.removesuffix(ending)
             break
@@ -135,11 +134,7 @@ def words_of(point: Point) -> str:
     return ", ".join(f"{name} {text}" for name, text in point.parameters) or "the scenario as it is"
 
 
-def motion_of(rows: Iterable[RunRow]) -> float:
-    """The longest motion that was judged [s], 0 without any: that of a run which nothing cut short."""
-    return max((row.ended_s for row in rows if row.ended_s is not None), default=0.0)
-
-
-def ended_early(rows: Iterable[RunRow], motion_s: float) -> int:
-    """Runs whose motion was shorter than that, so that their metrics cover less of it than those of others."""
-    return sum(row.ended_s is not None and row.ended_s < motion_s - 1e-9 for row in rows)
+def ended_early(rows: Iterable[RunRow], motions: Mapping[Point, float]) -> int:
+    """Runs whose motion was shorter than their point's [s], so that their metrics cover a part of it only."""
+    full = ((row.ended_s, motions.get(row.point)) for row in rows)
+    return sum(ended is not None and motion is not None and ended < motion - 1e-9 for ended, motion in full)

@@ -5,13 +5,13 @@ units beside the same paper's numbers; where there are too many, all are taken t
 """
 
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from testbench.campaign.file.axes import Axis
 from testbench.campaign.file.rules import Figure
-from testbench.campaign.records import RunRow
+from testbench.campaign.records import Point, RunRow
 from testbench.campaign.report.figures import (
     Column,
     Curve,
@@ -26,7 +26,6 @@ from testbench.campaign.report.measured import (
     count,
     ended_early,
     is_share,
-    motion_of,
     number_at,
     quantity,
     stating,
@@ -37,6 +36,7 @@ from testbench.campaign.report.tables import Table, number
 from testbench.campaign.statistics.fits import QuadraticFit, quadratic_fit
 from testbench.campaign.statistics.samples import Summary, mean_interval, median_interval, summary
 from testbench.campaign.statistics.shares import Interval, NotEstimableError, wilson
+from testbench.campaign.words import interval_note
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as DrawnFigure
@@ -56,7 +56,7 @@ _GOLDEN_RATIO: Final = 0.618034
 class Panel:
     """A figure wanted, for one combination of the other axes (`held`, in words), with its runs by rising x.
 
-    motion_s: of a run that nothing cut short. together: for all combinations instead; runs at one x then share seeds
+    motions: as in Meta. together: for all combinations instead; runs at one x then share seeds
     and depend on each other, so that there are no intervals.
     """
 
@@ -64,7 +64,7 @@ class Panel:
     axis: Axis
     held: str
     together: bool
-    motion_s: float
+    motions: Mapping[Point, float]
     columns: tuple[tuple[float, tuple[RunRow, ...]], ...]
 
     @property
@@ -84,7 +84,6 @@ def panels(rows: Sequence[RunRow], meta: Meta) -> list[Panel]:
 
 
 def _panels(rows: Sequence[RunRow], meta: Meta, wanted: Figure) -> Iterator[Panel]:
-    motion_s = motion_of(rows)
     (axis,) = (axis for axis in meta.axes if axis.name == wanted.x)
     inside: dict[tuple[tuple[str, str], ...], dict[float, list[RunRow]]] = {}
     for point, found in by_point(rows, meta.points).items():
@@ -98,11 +97,11 @@ def _panels(rows: Sequence[RunRow], meta: Meta, wanted: Figure) -> Iterator[Pane
             for x, found in columns.items():
                 pooled.setdefault(x, []).extend(found)
         names = " and ".join(one.name for one in meta.axes if one is not axis)
-        yield Panel(wanted, axis, f"all values of {names} together", True, motion_s, _by_x(pooled))
+        yield Panel(wanted, axis, f"all values of {names} together", True, meta.motions, _by_x(pooled))
         return
     for held, columns in inside.items():
         words = ", ".join(f"{name} {text}" for name, text in held)
-        yield Panel(wanted, axis, words, False, motion_s, _by_x(columns))
+        yield Panel(wanted, axis, words, False, meta.motions, _by_x(columns))
 
 
 def _by_x(columns: dict[float, list[RunRow]]) -> tuple[tuple[float, tuple[RunRow, ...]], ...]:
@@ -115,7 +114,9 @@ def figure_section(rows: Sequence[RunRow], meta: Meta) -> tuple[Html | None, int
     found = [one for one in drawn if one is not None]
     if not found:
         return None, 0
-    return tag("section", tag("h2", "Figures"), tag("div", *found, class_="figures"), id="figures"), len(drawn)
+    note = interval_note(meta.rule) if any(is_share(one.y) for one in meta.figures) else ""
+    said = [tag("p", note, class_="note")] if note else []
+    return tag("section", tag("h2", "Figures"), tag("div", *found, class_="figures"), *said, id="figures"), len(drawn)
 
 
 def _figure(panel: Panel, k: int) -> Html | None:
@@ -180,7 +181,10 @@ def panel_title(panel: Panel) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Described:
-    """The values of y at one x. mean, median: their intervals, None where too few or equal, for dependent runs."""
+    """The values of y at one x.
+
+    mean, median: their intervals, None for too few values, for equal ones, for dependent runs.
+    """
 
     x: float
     values: Summary
@@ -191,17 +195,22 @@ class Described:
 def described_columns(panel: Panel) -> list[Described]:
     """What is said about the values at every x with runs that have one."""
     found = ((x, values_of(rows, panel.wanted.y)) for x, rows in panel.columns)
-    described = []
-    for x, values in found:
-        if values:
-            mean, median = (None if panel.together else _due(of, values) for of in (mean_interval, median_interval))
-            described.append(Described(x, summary(values), mean, median))
-    return described
+    return [
+        Described(
+            x,
+            summary(values),
+            None if panel.together else _interval(mean_interval, values),
+            None if panel.together else _interval(median_interval, values),
+        )
+        for x, values in found
+        if values
+    ]
 
 
-def _due(interval_of: Callable[[Sequence[float]], Interval], values: Sequence[float]) -> Interval | None:
+def _interval(of: Callable[[Sequence[float]], Interval], values: Sequence[float]) -> Interval | None:
+    """None where there is none; equal values, whose spread of 0 would claim a number without doubt, have none."""
     try:
-        return interval_of(values)
+        return of(values) if min(values) < max(values) else None
     except NotEstimableError:
         return None
 
@@ -233,14 +242,15 @@ def fits_of(panel: Panel) -> Fits | None:
 
 def values_section(rows: Sequence[RunRow], meta: Meta) -> Html | None:
     """A table of each figure's numbers, the paper's beside ours; None when no figure shows a metric."""
-    tables = [table(one.caption, one.heads, one.body, one.texts) for one in values_tables(rows, meta)]
+    found = values_tables(rows, meta)
+    tables = [table(one.caption, one.heads, one.body, one.texts) for one in found]
     if not tables:
         return None
     note = (
-        "Mean with its 95 % interval (Student's t), which covers less where single values lie far above the others; "
-        "median with its own (order statistics, from 6 runs on), which holds for any distribution; quartiles: a "
-        "quarter of the runs below the first, a quarter above the second. Behind a published number stands whether it "
-        "is inside the interval of our mean, below or above it."
+        "Mean with its 95 % interval (Student's t), median with its own (between order statistics, from six runs up): "
+        "where a few runs lie far above all others, the interval of the mean is too narrow on their side, that of the "
+        "median holds. Quartiles: a quarter of the runs below the first, a quarter above the second. Behind a "
+        "published number stands whether it is inside the interval of our mean, below or above it."
     )
     heading = tag("h2", "Numbers of the figures")
     return tag("section", heading, *tables, tag("p", note, class_="note"), id="values")
@@ -301,7 +311,7 @@ def _curve(fits: Fits | None) -> Curve | None:
 
 def _cut_words(panel: Panel) -> str:
     """What has to be said under numbers of runs that were cut short, "" for none."""
-    early = ended_early(panel.rows, panel.motion_s)
+    early = ended_early(panel.rows, panel.motions)
     if not early:
         return ""
     subject, their = ("1 run", "its") if early == 1 else (f"{early} runs", "their")

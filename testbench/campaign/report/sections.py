@@ -11,6 +11,7 @@ from testbench.campaign.report.measured import EXCEEDED, by_point, count, is_sea
 from testbench.campaign.report.meta import Meta
 from testbench.campaign.report.notable import Notable, latest_noticed, odd, replay_command, slowest, worst
 from testbench.campaign.report.tables import outcome_table, plain_share, words
+from testbench.campaign.words import interval_note
 
 _MOST_ROWS: Final = 240
 
@@ -83,7 +84,7 @@ def outcome_section(rows: Sequence[RunRow], meta: Meta) -> Html:
         "p",
         "Shares are over the runs that make a statement; in brackets the Wilson interval at 95 %. A limit is exceeded "
         "when a torque, a speed or an angle is beyond it. Noticed: drive or controller reacted after the first fault "
-        f"began; the median time it took them.{note}",
+        f"began; the median time it took them.{note} {interval_note(meta.rule)}".rstrip(),
         class_="note",
     )
     seen = [outcome for outcome in COLOURS if any(row.outcome is outcome for row in rows)]

@@ -9,7 +9,7 @@ from testbench.campaign.file.rules import FAILURE
 from testbench.campaign.records import NO_STATEMENT, Outcome, RunRow
 from testbench.campaign.report.measured import BEYOND_3DEG, EXCEEDED, by_point, count, points_of, stating
 from testbench.campaign.report.meta import Meta
-from testbench.campaign.statistics.shares import wilson
+from testbench.campaign.words import share_text
 
 SHARES: Final = {
     FAILURE: "failed",
@@ -59,14 +59,6 @@ def number(value: float) -> str:
     return f"{value:.0f}" if 1000 <= abs(value) < 1e6 else f"{value:.3g}"
 
 
-def share_text(part: int, whole: int) -> str:
-    """`12 % (4 to 28 %)`: a share with its Wilson interval; none where there is nothing to take a share of."""
-    if not whole:
-        return "none"
-    interval = wilson(part, whole)
-    return f"{_percent(part / whole)} % ({_percent(interval.low)} to {_percent(interval.high)} %)"
-
-
 def plain_share(part: int, whole: int) -> str:
     """Without interval, for points taken together: with the same seeds, their runs depend on each other."""
     return f"{100 * part / whole:.1f} %" if whole else "none"
@@ -75,10 +67,6 @@ def plain_share(part: int, whole: int) -> str:
 def words(outcome: Outcome) -> str:
     """An outcome as prose."""
     return outcome.value.replace("_", " ")
-
-
-def _percent(share: float) -> str:
-    return f"{100 * share:.0f}" if share in (0, 1) else f"{100 * share:.1f}"
 
 
 def _noticed(rows: Sequence[RunRow]) -> str:

@@ -5,10 +5,12 @@ or another version of the program has made, stays and does not count.
 """
 
 import json
+from collections.abc import Iterable
 from pathlib import Path
 
+from testbench.campaign.file.axes import Axis
 from testbench.campaign.file.schema import Campaign, stored_campaign
-from testbench.campaign.records import RunRow
+from testbench.campaign.records import Point, RunRow
 from testbench.campaign.report.meta import Meta
 from testbench.campaign.store.store import Store, StoreError
 from testbench.campaign.words import asked
@@ -73,8 +75,29 @@ def contents(store: Store) -> tuple[list[RunRow], Meta]:
         jobs=last.jobs if last else 1,
         versions={"code": last.code_version} if last else {},
         notes=tuple(notes),
+        motions=_motions(campaign, {row.point for row in rows}),
     )
     return rows, meta
+
+
+def _motions(campaign: Campaign, points: Iterable[Point]) -> dict[Point, float]:
+    """How long the motion is to be at each point [s]; read once for each setting of it. {} where no run ends early."""
+    if campaign.stop_early is None:
+        return {}
+    about = {axis.name for axis in campaign.axes if _sets_motion(axis)}
+    known: dict[tuple[tuple[str, str], ...], float] = {}
+    found = {}
+    for point in points:
+        place = tuple(pair for pair in point.parameters if pair[0] in about)
+        if place not in known:
+            known[place] = campaign.settings.scenario(point).motion.duration_ns / 1e9
+        found[point] = known[place]
+    return found
+
+
+def _sets_motion(axis: Axis) -> bool:
+    keys = {key for text in axis.texts for key, _ in axis.settings(text)}
+    return any(key.partition(".")[0] == "motion" for key in keys)
 
 
 def _others(store: Store) -> list[tuple[str, int]]:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from testbench.campaign.file.values import number_of
-from testbench.campaign.records import InjectionRow, Outcome, RunRow
+from testbench.campaign.records import UNITS, InjectionRow, Outcome, RunRow
 from testbench.errors import BenchError
 
 Cell = str | int | float | None
@@ -21,7 +21,6 @@ Table = dict[str, list[Cell]]
 _FLAT: Final = tuple(
     entry.name for entry in fields(RunRow) if entry.name not in ("point", "metrics", "injections", "versions")
 )
-_UNITS: Final = (("_rad_s", "rad/s"), ("_rad", "rad"), ("_nm", "N m"), ("_deg", "deg"), ("_rpm", "rpm"), ("_s", "s"))
 
 
 def run_table(rows: Sequence[RunRow]) -> Table:
@@ -108,4 +107,4 @@ def _unit(name: str, values: Sequence[Cell], table: Table) -> str:
         first = next((number_of(str(text)) for text in table[axis] if text is not None), None)
         return "" if first is None else first.unit
     numeric = any(isinstance(value, float) for value in values)
-    return next((unit for ending, unit in _UNITS if numeric and name.endswith(ending)), "")
+    return next((unit for ending, unit in UNITS if numeric and name.endswith(ending)), "")

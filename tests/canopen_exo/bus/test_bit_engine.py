@@ -403,6 +403,7 @@ def test_double_flip_that_all_see_is_caught_by_the_sender(frame: Frame, pair: tu
     assert receivers.accepted is None
 
 
+@pytest.mark.long
 def test_single_flips_at_one_receiver_are_all_caught() -> None:
     """100,000 random flips SOF..CRC of random 8-byte frames: no other frame is ever accepted."""
     rng = np.random.default_rng(20)

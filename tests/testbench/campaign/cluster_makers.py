@@ -4,6 +4,7 @@ import os
 import threading
 from pathlib import Path
 
+from testbench.campaign.making.executor import FolderError
 from testbench.campaign.making.worker import MakeRun
 from testbench.campaign.records import Outcome, RunRow, RunSpec
 
@@ -33,6 +34,24 @@ def dying_once() -> MakeRun:
             mark.touch()
             os._exit(1)
         return row_of(spec)
+
+    return make
+
+
+def dying() -> MakeRun:
+    """Every run kills its process, every time."""
+
+    def make(spec: RunSpec) -> RunRow:
+        os._exit(1)
+
+    return make
+
+
+def no_folder() -> MakeRun:
+    """The result folder of every run cannot be written."""
+
+    def make(spec: RunSpec) -> RunRow:
+        raise FolderError("result folder there: cannot be written")
 
     return make
 

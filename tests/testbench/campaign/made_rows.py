@@ -76,6 +76,7 @@ def meta(
     description: str = "a frozen knee",
     text: str = "name: knee\n",
     store: str = "results/campaigns/knee.sqlite",
+    motions: Mapping[Point, float] | None = None,
 ) -> Meta:
     return Meta(
         name=name,
@@ -92,6 +93,7 @@ def meta(
         figures=tuple(figures),
         command="exo-hil campaign run campaigns/knee.yaml",
         versions={"exo-hil": "0.1.0"},
+        motions=motions or {},
     )
 
 

@@ -113,6 +113,21 @@ def test_run_that_never_ends_is_a_hang_and_others_go_on(address: str) -> None:
 
 
 @pytest.mark.run
+def test_hang_of_an_earlier_campaign_is_none_of_this_one(address: str) -> None:
+    """The scheduler keeps what was said; a run of the same identity that crashes now did not hang."""
+    one = replace(spec("golden"), identity="hung before", time_limit_s=0.5)
+    assert rows_of(Cluster(address, f"{MAKERS}:hanging"), [one])[one.identity].outcome is Outcome.HANG
+    again = replace(one, time_limit_s=60.0)
+    assert rows_of(Cluster(address, f"{MAKERS}:dying"), [again])[one.identity].outcome is Outcome.CRASHED
+
+
+@pytest.mark.run
+def test_result_folder_that_cannot_be_written_there_ends_the_campaign(address: str) -> None:
+    with pytest.raises(ExecutorError, match="worker's machine: result folder there: cannot be written"):
+        rows_of(Cluster(address, f"{MAKERS}:no_folder"), [replace(spec("golden"), identity="full")])
+
+
+@pytest.mark.run
 def test_defect_in_a_run_is_recorded_with_its_traceback(address: str) -> None:
     row = rows_of(Cluster(address, f"{MAKERS}:raising"), [replace(spec("golden"), identity="broken")])["broken"]
     assert row.outcome is Outcome.CRASHED

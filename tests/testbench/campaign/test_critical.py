@@ -11,7 +11,7 @@ from scipy import integrate, stats
 
 from testbench.campaign.plans.critical import Answer, CriticalPlan, CriticalResult
 from testbench.campaign.plans.probing import Side, evidence, most_values
-from testbench.campaign.plans.search import METHODS, SCANNED, CriticalSearch, split_quantity
+from testbench.campaign.plans.search import METHODS, SCANNED, CriticalSearch
 from testbench.campaign.records import Outcome, Point, RunRow, Wanted
 from testbench.campaign.statistics.shares import Tally, wilson
 from tests.testbench.campaign.worlds import Logistic, failing, play, row, searched
@@ -46,22 +46,6 @@ def test_values_are_written_as_the_scenario_file_says_them() -> None:
     ]
     hundreds = CriticalSearch("n", Decimal("0"), Decimal("1e3"), Decimal("100"), "")
     assert [hundreds.text(index) for index in (0, 1, 10)] == ["0", "100", "1000"]
-
-
-@pytest.mark.parametrize(
-    ("text", "number", "unit"),
-    [("0.05 s", "0.05", "s"), ("-3deg", "-3", "deg"), ("1e-3 N m", "0.001", "N m"), ("7", "7", "")],
-)
-def test_a_quantity_is_its_number_as_written_and_its_unit(text: str, number: str, unit: str) -> None:
-    """No rounding through a float."""
-    assert split_quantity(text) == (Decimal(number), unit)
-
-
-@pytest.mark.parametrize("text", ["", "s", "NaN s", "inf", ",5 s", "1,5"])
-def test_what_is_no_quantity_is_refused(text: str) -> None:
-    """With an example."""
-    with pytest.raises(ValueError, match=r"0\.05 s"):
-        split_quantity(text)
 
 
 @pytest.mark.parametrize(
@@ -150,6 +134,7 @@ def test_bisection_closes_in_on_a_step() -> None:
         assert result.text == f"{result.value:.3f} s (0.730 s to 0.740 s)"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("quantile", [0.5, 0.2])
 @pytest.mark.parametrize("method", METHODS)
 def test_the_interval_holds_the_true_value(method: str, quantile: float) -> None:
@@ -315,6 +300,7 @@ def test_a_map_has_one_search_for_each_combination_of_the_other_axes() -> None:
     assert holds(late, 2.1)
 
 
+@pytest.mark.long
 def test_no_more_values_are_tried_than_the_promise_allows_for() -> None:
     """Each value tried has its part of the probability of error."""
     search = replace(SEARCH, tolerance=Decimal("0.01"), most=400, batch=1, confidence=0.5)  # decides soon, and wrongly

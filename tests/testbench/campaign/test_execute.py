@@ -7,6 +7,7 @@ import pytest
 
 from fi_gateway.marked_yaml import FileErrors
 from testbench.campaign.making.execute import Workshop, make_run
+from testbench.campaign.making.executor import FolderError
 from testbench.campaign.records import Outcome
 from testbench.run import run_scenario
 from testbench.scenario import load_scenario
@@ -84,6 +85,15 @@ def test_traces_are_kept_as_a_result_folder_when_asked_for(workshop: Workshop, t
     summary = json.loads((tmp_path / "one" / "summary.json").read_text(encoding="utf-8"))
     assert summary["trace_hash"]["faulted"] == failing.trace_hash
     assert (tmp_path / "one" / "joints.png").is_file()
+
+
+def test_result_folder_that_cannot_be_written_is_an_error_not_a_row(workshop: Workshop, tmp_path: Path) -> None:
+    """The run was judged: as crashed or invalid it would leave the shares because a disk is full."""
+    (tmp_path / "file").touch()
+    one = spec("golden", "motion.duration=0.1 s", keep_traces="always", folder=str(tmp_path / "file" / "1-0"))
+    with pytest.raises(FolderError, match=r"^result folder .*1-0: .* is a file; give another place"):
+        make_run(one, workshop)
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
 SILENCE = (

@@ -140,6 +140,7 @@ def test_a_fall_is_told_from_chance() -> None:
     assert fall_misfit(hump[:1], generator) == 1
 
 
+@pytest.mark.long
 def test_another_curve_is_told_from_chance() -> None:
     """p below 0.05 in at most 9 of 60 logistic worlds (3 + 3.5 standard errors); below 0.01 for two steps."""
     generator = np.random.default_rng(35)

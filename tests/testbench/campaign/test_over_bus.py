@@ -10,6 +10,7 @@ from canopen_exo.bus.node import NEVER
 from fi_gateway.control_socket import Listing
 from fi_gateway.errors import FaultError
 from testbench.campaign.making import over_bus
+from testbench.campaign.making.executor import FolderError
 from testbench.campaign.making.over_bus import OverBus, Rigging, arm, check_scenario
 from testbench.campaign.records import Outcome, RunRow, RunSpec
 from testbench.errors import BenchError
@@ -80,6 +81,20 @@ def test_run_that_proves_nothing_is_made_three_times_and_then_recorded(monkeypat
     [row] = rows_of(OverBus(Rigging()), [spec("knee_freeze_at")])
     assert (row.outcome, row.reason, row.attempts) == (Outcome.INVALID, "golden run: the drives are away", 3)
     assert len(tried) == 3
+
+
+def test_result_folder_that_cannot_be_written_is_no_try_that_proves_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It ends the campaign at once, and no row is recorded."""
+    tried: list[Setup] = []
+
+    def full(setup: Setup, **_: object) -> RealTimeRun:
+        tried.append(setup)
+        raise FolderError("result folder there: cannot be written")
+
+    monkeypatch.setattr(over_bus, "run_once", full)
+    with pytest.raises(FolderError, match="cannot be written"):
+        rows_of(OverBus(Rigging()), [spec("knee_freeze_at")])
+    assert len(tried) == 1
 
 
 @pytest.mark.parametrize("zero_ns", [NEVER, 5_000_000_000])

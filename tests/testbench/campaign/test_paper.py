@@ -38,6 +38,7 @@ def test_every_table_is_made_by_the_recipe() -> None:
         assert (ROOT / path).is_file()
 
 
+@pytest.mark.long
 def test_every_campaign_of_the_paper_can_be_run() -> None:
     """Files, scenarios and every point are valid; experiment 1 has the paper's 20 durations, 0.5 s once."""
     campaigns = {path.stem: load_campaign(path) for path in FILES}

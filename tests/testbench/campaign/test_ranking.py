@@ -75,6 +75,7 @@ def test_a_parameter_that_matters_without_rising_or_falling_is_found() -> None:
     assert found.p_value < 1e-6
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["metric", "outcome"])
 def test_p_values_and_strengths_are_right_where_nothing_matters(kind: str) -> None:
     """300 campaigns: p below 0.05 in 5 % (twice the smaller one: at most that); mean strength about 0."""

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from testbench.campaign.file.rules import Until
 from testbench.campaign.records import Outcome, RunRow
 from testbench.campaign.report.markdown import table_of
 from testbench.campaign.report.meta import Meta
@@ -130,11 +131,15 @@ def test_numbers_of_a_figure_stand_beside_the_papers() -> None:
     assert cells[8:] == ["0.1", "3", "3 (-3.57 to 9.57)", "2", "1.5, 4", "1", "6", "2.5 (inside)"]
 
 
-def test_median_has_its_own_interval_from_six_runs_on() -> None:
-    """Order statistics: of six values the smallest to the largest hold the median in 1 - 2 / 64 = 97 % of all cases."""
-    points, rows = over_duration(["0.1 s"], {"0.1 s": [1, 2, 3, 4, 5, 90]})
-    html = html_text(rows, meta([axis("duration", "0.1 s")], points, [figure()]))
-    assert ">3.5 (1 to 90)<" in html
+def test_median_has_its_interval_beside_that_of_the_mean() -> None:
+    """Between smallest and largest of six values (1 - 2/64 = 96.9 %), where one run is far above; none for five."""
+    values = [1.0, 2.0, 3.0, 4.0, 5.0, 900.0]
+    points, rows = over_duration(["0.1 s", "0.2 s"], {"0.1 s": values, "0.2 s": values[:5]})
+    about = meta([axis("duration", "0.1 s", "0.2 s")], points, [figure()])
+    html = html_text(rows, about)
+    cells = re.findall(r"<td[^>]*>(.*?)</td>", html[html.index('id="values"') :].split("</section>")[0])
+    assert (cells[2], cells[8]) == ("3.5 (1 to 900)", "3")
+    assert "3.5 (1 to 900)" in table_of(rows, about, "values 1")
 
 
 @pytest.mark.parametrize(("paper", "said"), [(-3.6, "below"), (-3.5, "inside"), (9.5, "inside"), (9.6, "above")])
@@ -165,6 +170,16 @@ def test_shares_leave_out_what_makes_no_statement_and_say_so() -> None:
     assert "In 2 runs a limit of torque, speed or angle was exceeded." in said
 
 
+def test_intervals_that_were_asked_for_repeatedly_say_so_where_they_stand() -> None:
+    """Rule `until`: beside table and figure of shares; a fixed number of runs has nothing to say."""
+    at = point(duration="0.1 s")
+    rows = [row(at, k, Outcome.MASKED) for k in range(20)]
+    axes, shown, note = [axis("duration", "0.1 s")], [figure("failure")], "cover less often than 95 %"
+    until = meta(axes, [at], shown, rule=Until("failure", 0.1, 20, 20, 400))
+    assert words(rows, until).count(note) == 2
+    assert note not in words(rows, meta(axes, [at], shown))
+
+
 def test_unfinished_campaign_says_what_is_missing() -> None:
     """A report of a part must not read like one of the whole; one without any run is made, too."""
     rows, about = parabola()
@@ -176,10 +191,19 @@ def test_runs_cut_short_are_told_under_their_numbers() -> None:
     """After an early stop an RMSE covers less of the motion; it must not pass for one of the whole."""
     points, rows = over_duration(["0.1 s"], {"0.1 s": [1.0, 2.0]})
     cut = row(points[0], 2, metrics={RMSE: 3.0}, ended_s=2.5)
-    about = meta([axis("duration", "0.1 s")], points, [figure()])
+    about = meta([axis("duration", "0.1 s")], points, [figure()], motions={points[0]: 7.0})
     assert "1 run ended early: its numbers cover a part of the motion." in words([*rows, cut], about)
     table = table_of([*rows, cut], about, "values 1").splitlines()[0]
     assert table.endswith("in rad (1 run ended early: its numbers cover a part of the motion):")
+    assert "ended early" not in words(rows, about)
+    assert "1 run ended early" in words([cut], about), "also where no run went to its end"
+
+
+def test_motions_of_other_length_are_not_cut_short() -> None:
+    """An axis over the length of the motion: each run is held against its own point's."""
+    points = [point(duration="2 s"), point(duration="7 s")]
+    rows = [row(points[k], 0, metrics={RMSE: 1.0}, ended_s=ended) for k, ended in enumerate((2.0, 7.0))]
+    about = meta([axis("duration", "2 s", "7 s")], points, [figure()], motions={points[0]: 2.0, points[1]: 7.0})
     assert "ended early" not in words(rows, about)
 
 

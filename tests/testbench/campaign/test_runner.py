@@ -10,6 +10,7 @@ from testbench.campaign.file.schema import Campaign
 from testbench.campaign.making.executor import Executor
 from testbench.campaign.records import Known, Outcome, Plan, Point, RunRow, RunSpec, Wanted
 from testbench.campaign.runner import Finished, Progress, Runner, Way
+from testbench.campaign.store.archive import contents, remember
 from testbench.campaign.store.store import Store, StoreError, open_store
 from tests.testbench.campaign.campaigns import small
 from tests.testbench.campaign.workers import row_of
@@ -155,6 +156,19 @@ def test_early_stop_makes_another_run() -> None:
     }
     assert len({plain, *stopped}) == 3
     assert small(("runs: 3", "runs: 3\ntime_limit: 5 s\ntraces: always")).identity_of(wanted, "v1") == plain
+
+
+@pytest.mark.parametrize("stop", ["", "stop_early: {on: failure, grace: 0.2 s}\n"])
+def test_full_length_of_the_motion_is_known_for_each_point(store: Store, stop: str) -> None:
+    """What a run that ended early is held against."""
+    lengths = "  walk: {set: motion.duration, values: [2 s, 4 s]}\nruns: 3\n"
+    campaign = small(("runs: 3\n", lengths + stop))
+    remember(store, campaign)
+    run(campaign, store)
+    _, meta = contents(store)
+    assert sorted(meta.motions.values()) == ([2.0, 2.0, 4.0, 4.0] if stop else [])
+    for point, motion_s in meta.motions.items():
+        assert dict(point.parameters)["walk"] == f"{motion_s:g} s"
 
 
 class TwoSteps(Plan):

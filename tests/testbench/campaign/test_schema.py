@@ -3,6 +3,7 @@
 In the table the sign § stands before the character that the complaint must point at; it is not part of the file.
 """
 
+from decimal import Decimal
 from pathlib import Path
 
 import pytest
@@ -208,6 +209,7 @@ def test_critical_search_has_the_ends_of_its_axis() -> None:
     rule = campaign.rule
     assert isinstance(rule, CriticalSearch)
     assert (rule.text(0), rule.text(rule.steps), rule.method) == ("0.05 s", "0.3 s", "logistic")
+    assert (rule.value(1), rule.unit) == (Decimal("0.06"), "s"), "no rounding through a float"
     assert [point.parameters for point in campaign.points] == [(("stops", "on"),), (("stops", "off"),)]
     assert "duration: 0.13 s" in campaign.scenario_text(Point((("duration", "0.13 s"), ("stops", "on"))))
     too_short = (VALUES, "between: {from: 0 s, to: 0.3 s}")

@@ -5,6 +5,7 @@ import signal
 import threading
 from pathlib import Path
 
+from testbench.campaign.making.executor import FolderError
 from testbench.campaign.making.worker import MakeRun
 from testbench.campaign.records import InjectionRow, Outcome, Point, RunRow, RunSpec, Wanted
 
@@ -108,6 +109,15 @@ def raises() -> MakeRun:
     def make(given: RunSpec) -> RunRow:
         tried(given)
         raise ZeroDivisionError(f"run {given.identity}")
+
+    return make
+
+
+def no_folder() -> MakeRun:
+    """The result folder of every run cannot be written."""
+
+    def make(given: RunSpec) -> RunRow:
+        raise FolderError("result folder there: cannot be written")
 
     return make
 
