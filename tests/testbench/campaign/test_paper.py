@@ -99,28 +99,28 @@ def made_again(campaign: Campaign, point: Point, runs: int) -> list[RunRow]:
 
 @pytest.mark.run
 @pytest.mark.parametrize(
-    ("store", "value", "what"),
-    [("rmse_over_duration-pins", "0.05 s", "values 1"), ("bit_flips", "17", "outcomes")],
+    ("store", "values", "what"),
+    [("rmse_over_duration-pins", ("0.05 s",), "values 1"), ("compensated", ("single", "0.1 s"), "outcomes")],
 )
-def test_line_of_the_document_comes_out_again(store: str, value: str, what: str) -> None:
+def test_line_of_the_document_comes_out_again(store: str, values: tuple[str, ...], what: str) -> None:
     """Same seeds, same numbers: the runs of one point, made anew, give the line that stands in the document."""
     path, changes, runs = recipe_of(store)
     campaign = load_campaign(ROOT / path, changes)
-    (point,) = (point for point in campaign.points if point.parameters[0][1] == value)
+    (point,) = (point for point in campaign.points if tuple(text for _, text in point.parameters) == values)
     (table,) = (text for name, words, text in blocks() if (name, words) == (store, what))
-    number = value.split()[0] if what.startswith("values") else value  # these tables have the unit in the head
-    written = _cells(table, number)
+    begin = [text.split()[0] for text in values] if what.startswith("values") else [*values]  # unit in their head
+    written = _cells(table, begin)
     assert runs is not None
     assert int(written["runs"]) == runs
     rows = made_again(campaign, point, runs)
-    again = _cells(table_of(rows, about(campaign, (point,)), what), number)
+    again = _cells(table_of(rows, about(campaign, (point,)), what), begin)
     others = written.keys() - again.keys()  # outcomes that other points show
     assert {head: written[head] for head in again} == again
     assert {written[head] for head in others} <= {"0", ""}
 
 
-def _cells(table: str, first: str) -> dict[str, str]:
-    """Cells by head, of the line that begins with `first`."""
+def _cells(table: str, begin: list[str]) -> dict[str, str]:
+    """Cells by head, of the line whose first cells are `begin`."""
     lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in table.splitlines() if line.startswith("|")]
-    (found,) = (line for line in lines[2:] if line[0] == first)
+    (found,) = (line for line in lines[2:] if line[: len(begin)] == begin)
     return dict(zip(lines[0], found, strict=True))
