@@ -91,7 +91,7 @@ bench: $(READY) ## measured ratios against the budgets; nothing is asserted
 soak: $(READY) ## ten million frames through the gateway, then a full bus: none lost, doubled, changed or out of order
 	$(BIN)/python -m benchmarks.soak
 
-paper: $(READY) ## the campaigns of docs/paper.md, and its tables from them: an hour or two; goes on where it was
+paper: $(READY) ## the campaigns of docs/paper.md, and its tables from them (how long: there); goes on where it was
 	@run() { echo "campaign run $$*"; $(BIN)/exo-hil campaign run "$$@" || [ $$? = 3 ]; }; to=results/campaigns; set -e; \
 	run campaigns/rmse_over_duration.yaml --out $$to/rmse_over_duration.sqlite; \
 	run campaigns/rmse_over_duration.yaml --out $$to/rmse_over_duration-pins.sqlite --set rig.stops=on --runs 10; \
