@@ -185,6 +185,7 @@ def _places(options: argparse.Namespace, without: frozenset[str]) -> tuple[str, 
 
 def _loaded(options: argparse.Namespace) -> "tuple[Scenario, Replay | None]":
     """The scenario to run, and what is replayed in it; raises FileErrors and BenchError."""
+    from fi_gateway.marked_yaml import FileErrors
     from testbench.errors import BenchError
     from testbench.replay import load_replay
     from testbench.scenario import load_scenario
@@ -195,7 +196,15 @@ def _loaded(options: argparse.Namespace) -> "tuple[Scenario, Replay | None]":
     if options.replay is None:
         if options.seed is not None:
             overrides.append(f"seed={options.seed}")
-        return load_scenario(options.scenario, overrides), None
+        try:
+            return load_scenario(options.scenario, overrides), None
+        except FileErrors:
+            from testbench.campaign.file.schema import is_campaign_file
+
+            if is_campaign_file(options.scenario):
+                told = f"this is a campaign; `exo-hil campaign run {options.scenario}` runs it"
+                raise BenchError(f"{options.scenario}: {told}") from None
+            raise
     if options.realtime or options.seed is not None:
         raise BenchError("--replay runs in virtual time and draws nothing anew; leave out --realtime and --seed")
     replay = load_replay(options.replay, overrides)

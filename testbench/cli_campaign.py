@@ -27,6 +27,10 @@ if TYPE_CHECKING:
     from testbench.process import Orders
 
 INTERRUPTED: Final = 130
+_ABOUT: Final = (
+    "Run one scenario many times, over a grid of values, and keep what came out in a store; see docs/campaigns.md. "
+    "Exit codes: 0 done, 2 usage, bad file or store, 3 some runs make no statement, 130 interrupted."
+)
 _RETRY: Final = (
     "make runs that crashed or hung once more, with --realtime invalid ones too (they may come out otherwise)"
 )
@@ -34,7 +38,7 @@ _RETRY: Final = (
 
 def add_campaign_verbs(verbs: Verbs, show: Callable[[str], None]) -> None:
     """Add `campaign` and its words; show: prints a result to stdout."""
-    campaign = verbs.add_parser("campaign", help="many runs: grids, statistics, reports", description=__doc__)
+    campaign = verbs.add_parser("campaign", help="many runs: grids, statistics, reports", description=_ABOUT)
     words = campaign.add_subparsers(title="words", metavar="WORD", required=True)
 
     run = words.add_parser("run", help="run a campaign, or go on with it", description=_run.__doc__)

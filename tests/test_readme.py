@@ -28,8 +28,8 @@ def examples() -> list[tuple[str, str]]:
 
 
 def output(command: str, work: Path) -> str:
-    """What the command prints, stdout then stderr, run in a folder with the repository's scenarios and docs."""
-    for name in ("scenarios", "docs"):
+    """What the command prints, stdout then stderr, run in a folder with the repository's files."""
+    for name in ("scenarios", "campaigns", "docs"):
         if not (work / name).exists():
             (work / name).symlink_to(ROOT / name)
     words = shlex.split(command)

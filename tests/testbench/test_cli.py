@@ -534,3 +534,11 @@ def test_each_word_of_live_control_says_what_it_did(
     monkeypatch.setattr("fi_gateway.control_socket.ask", lambda *given: {"ok": True, "done": done})
     assert main(["fault", *word.split()]) == 0
     assert capsys.readouterr().out == said
+
+
+def test_run_of_a_campaign_names_the_command_for_it(capsys: pytest.CaptureFixture[str]) -> None:
+    """One line with the remedy, not a list of keys that a scenario does not have."""
+    path = str(ROOT / "campaigns" / "bit_flips.yaml")
+    assert main(["run", path]) == 2
+    out, err = capsys.readouterr()
+    assert (out, err) == ("", f"{path}: this is a campaign; `exo-hil campaign run {path}` runs it\n")

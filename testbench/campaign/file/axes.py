@@ -51,9 +51,8 @@ class RangeSpec(SpecModel):
             raise ValueError(f"that is {math.floor(steps) + 1} values; allowed are {MOST_VALUES} on an axis")
         if steps.denominator != 1:
             last = format_number(low + math.floor(steps) * step)
-            raise ValueError(
-                f"steps of {self.step} from {self.low} do not meet {self.high}; the last one below it is {last} {unit}"
-            )
+            text = f"steps of {self.step} from {self.low} do not meet {self.high}; the last one below it is"
+            raise ValueError(f"{text} {last} {unit}".strip())
         numbers = [low + index * step for index in range(int(steps) + 1)]
         return [f"{format_number(number)} {unit}".strip() for number in numbers]
 

@@ -145,11 +145,10 @@ class _Parser:
     def _axis(self) -> _Value:
         name = self._word
         if self._kind != "word" or name in _RESERVED:
-            raise ValueError(f"expected an axis, found {name!r} (axes: {', '.join(self._axes)})")
+            raise ValueError(f"expected an axis, found {name!r} (axes: {', '.join(self._axes) or 'none'})")
         if name not in self._axes:
-            raise ValueError(
-                f"there is no axis {name!r}{did_you_mean(name, self._axes)} (axes: {', '.join(self._axes)})"
-            )
+            known = ", ".join(self._axes) or "none"
+            raise ValueError(f"there is no axis {name!r}{did_you_mean(name, self._axes)} (axes: {known})")
         self._at += 1
         return _Value(name, "", number_of(self._axes[name][0]))
 

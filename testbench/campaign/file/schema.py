@@ -292,7 +292,7 @@ def _names(data: Data) -> set[str]:
 
 def _read_filters(data: Data, axes: Sequence[Axis], broken: set[str], document: Document) -> list[Filter]:
     """The filters; those about axes that are wrong themselves are not looked at."""
-    values = {axis.name: axis.texts for axis in axes}
+    values = dict.fromkeys(sorted(broken), ("0",)) | {axis.name: axis.texts for axis in axes}
     filters = []
     items = data if isinstance(data, list) else [] if data is None else [data]
     for index, item in enumerate(items):

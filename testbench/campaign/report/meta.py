@@ -19,7 +19,8 @@ class Meta:
     name it; axes, points: as in the file, after filters; asked: what was wanted of each point, in words ("30 runs a
     point"); wanted: number of runs the plan wants by now; seed: of the campaign; command: what was typed; started,
     ended: UTC, ISO 8601; wall_s: of all its invocations together; jobs: processes; notes: what the reader has to know
-    besides, a line each; motions: full length of the motion at each point with runs [s], {} where none can end early.
+    besides, a line each; changes: `key=value` that were set on top of the file;
+    motions: full length of the motion at each point with runs [s], {} where none can end early.
     """
 
     name: str
@@ -41,4 +42,5 @@ class Meta:
     jobs: int = 1
     versions: Mapping[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    changes: tuple[str, ...] = ()
     motions: Mapping[Point, float] = field(default_factory=dict)

@@ -57,7 +57,8 @@ def html_text(rows: Sequence[RunRow], meta: Meta) -> str:
         tag("title", f"{meta.name}: campaign report"),
         tag("style", Html(files("testbench.campaign.report").joinpath(_STYLE).read_text(encoding="utf-8"))),
     )
-    header = tag("header", tag("h1", meta.name), tag("p", meta.description))
+    changed = [tag("p", f"Changed from the campaign file: {', '.join(meta.changes)}.")] if meta.changes else []
+    header = tag("header", tag("h1", meta.name), tag("p", meta.description), *changed)
     body = tag("body", header, headline(rows, meta), contents, tag("main", [content for _, _, content in there]))
     return f"<!DOCTYPE html>\n{tag('html', head, body, lang='en')}\n"
 

@@ -75,6 +75,7 @@ def contents(store: Store) -> tuple[list[RunRow], Meta]:
         jobs=last.jobs if last else 1,
         versions={"code": last.code_version} if last else {},
         notes=tuple(notes),
+        changes=campaign.changes,
         motions=_motions(campaign, {row.point for row in rows}),
     )
     return rows, meta

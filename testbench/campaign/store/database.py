@@ -126,7 +126,8 @@ _WORDS: Final = {
     "SQLITE_READONLY": f"it may not be written; change its permissions {_GO_ON}",
     "SQLITE_CANTOPEN": "it cannot be opened; look whether its folder is there and may be written, or give another "
     "place with --out",
-    "SQLITE_NOTADB": "this is no SQLite file, and was left alone; give another place with --out",
+    "SQLITE_NOTADB": "this is no SQLite file, and was left alone; name a store that `exo-hil campaign run` has "
+    "written, or for a new one another place with --out",
     "SQLITE_BUSY": f"somebody else is writing to it; end that program {_GO_ON}",
     "SQLITE_IOERR": "the disk cannot be read or written (full, or a file-size limit reached, or broken); make room "
     f"{_GO_ON}",

@@ -248,7 +248,7 @@ def test_export_writes_all_runs(tmp_path: Path, fake: Callable[[str], None]) -> 
     [
         (["run", "nothing.yaml"], "nothing.yaml: no such file"),
         (["status", "nothing.sqlite"], "no such file; `exo-hil campaign run` makes it"),
-        (["status", "small.yaml"], "this is no SQLite file"),
+        (["status", "small.yaml"], "name a store that `exo-hil campaign run` has written"),
         (["export", "nothing.sqlite"], "give --csv FILE, --parquet FILE, or both"),
         (["replay", "nothing.sqlite", "1/0"], "no such file"),
         (["report", "nothing.sqlite"], "no such file"),

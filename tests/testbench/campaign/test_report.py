@@ -3,6 +3,7 @@
 import re
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from html import unescape
 from html.parser import HTMLParser
 from pathlib import Path
@@ -294,3 +295,11 @@ def test_both_files_are_written_or_left_alone(tmp_path: Path) -> None:
     blocked.write_text("here")
     with pytest.raises(OSError, match="file"):
         write_report(rows, about, blocked / "knee.html", blocked / "knee.xml")
+
+
+def test_what_was_changed_from_the_file_is_said_at_the_head() -> None:
+    """Published numbers stand beside these; a reader must see that the runs are not those of the file."""
+    rows, about = parabola()
+    changed = html_text(rows, replace(about, changes=("motion.duration=3s",)))
+    assert "Changed from the campaign file: motion.duration=3s." in changed.partition("</header>")[0]
+    assert "Changed from" not in html_text(rows, about)

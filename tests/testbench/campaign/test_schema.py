@@ -125,6 +125,18 @@ def test_all_mistakes_are_said_at_once(tmp_path: Path) -> None:
     assert [message.partition(":")[0] for message in caught.value.messages] == [*[str(campaign)] * 2, str(scenario)]
 
 
+def test_a_filter_is_told_of_the_axes_that_are_wrong_themselves() -> None:
+    """They are in the file; a list without them would say that there are none."""
+    said = complaints(changed((VALUES, "values: [0.3 s, 20 %]"), ("seed: 5", "seed: 5\nfilter: [durtion < 1 s]")))
+    assert any("'durtion'; did you mean 'duration'? (axes: duration" in one for one in said)
+
+
+def test_a_range_of_numbers_without_unit_ends_its_message_cleanly() -> None:
+    """No unit, no space for it."""
+    wrong = "range: {from: 0.1, to: 1, step: 0.4}"
+    assert any(one.endswith("the last one below it is 0.9") for one in complaints(changed((VALUES, wrong))))
+
+
 def test_each_value_is_complained_about_once() -> None:
     """However many points have it; here two injectors get it."""
     text = changed((VALUES, f"values: [0.05 s, 0 s]\n  stops: {MORE.partition('stops: ')[2]}"))
