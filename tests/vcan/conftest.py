@@ -35,9 +35,6 @@ LIMIT_S: Final = 420.0
 """For all of them; alone on a machine they take a quarter of it, what waits for a clock may be repeated twice."""
 
 
-OF_RIGS: Final = ("test_rig", "test_plugin", "test_parity")
-"""Files of tests that need a rig which walks."""
-
 BEHIND_MS: Final = 1000.0
 """A drive has to answer a reset within a second; where its wake-ups come later than that, no rig can start."""
 
@@ -118,7 +115,7 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
         return None
     run = inner_run_of(item)
     report = run.reports.get((item.nodeid, call.when))
-    if report is not None and report.failed and item.path.stem in OF_RIGS and run.is_too_slow():
+    if report is not None and report.failed and "realtime" in item.keywords and run.is_too_slow():
         said = report.longreprtext.strip().splitlines()[-1:]
         reason = f"{BUSY}: drives were more than a second behind in this run; here: {' '.join(said)}"
         report.outcome, report.longrepr = "skipped", (str(item.path), 0, f"Skipped: {reason}")
