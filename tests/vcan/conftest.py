@@ -8,7 +8,6 @@ Where there is no SocketCAN to be had they are skipped, and the reason says what
 
 import json
 import os
-import re
 import sys
 import time
 from collections.abc import Iterator
@@ -35,12 +34,6 @@ LIMIT_S: Final = 420.0
 """For all of them; alone on a machine they take a quarter of it, what waits for a clock may be repeated twice."""
 
 
-BEHIND_MS: Final = 1000.0
-"""A drive has to answer a reset within a second; where its wake-ups come later than that, no rig can start."""
-
-_BEHIND: Final = re.compile(r"joints \d+, [^;]*?the latest ([\d.]+) ms")
-
-
 @final
 @dataclass(frozen=True, slots=True)
 class InnerRun:
@@ -53,11 +46,6 @@ class InnerRun:
     output: str
     refusal: str
     stopped_s: float
-
-    def is_too_slow(self) -> bool:
-        """Whether drives came so late in a test that was skipped for it that no controller could start them."""
-        late = (float(ms) for one in self.reports.values() if one.skipped for ms in _BEHIND.findall(str(one.longrepr)))
-        return max(late, default=0.0) >= BEHIND_MS
 
     def missing(self, node_id: str) -> NoReturn:
         """There is no report of this test: fails, unless it had no time left."""
@@ -113,13 +101,7 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
         return None
     if "inner_run" not in getattr(item, "funcargs", {}):  # there was none: the teardown of a skipped test
         return None
-    run = inner_run_of(item)
-    report = run.reports.get((item.nodeid, call.when))
-    if report is not None and report.failed and "realtime" in item.keywords and run.is_too_slow():
-        said = report.longreprtext.strip().splitlines()[-1:]
-        reason = f"{BUSY}: drives were more than a second behind in this run; here: {' '.join(said)}"
-        report.outcome, report.longrepr = "skipped", (str(item.path), 0, f"Skipped: {reason}")
-    return report
+    return inner_run_of(item).reports.get((item.nodeid, call.when))
 
 
 @pytest.fixture(scope="session")
