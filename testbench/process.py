@@ -210,9 +210,11 @@ def session(
 
 def joints_main(scenario: "Scenario", bus: BusName, options: ProcessOptions) -> int:
     """Six drives on their plant, until told to end."""
+    from joint_emulators.plant import rest_stopwatch
     from testbench.rig import build_mechanics, build_rack
     from testbench.run import rig_params
 
+    rest_stopwatch()
     params = rig_params(scenario)
     rack = build_rack(params, build_mechanics(params))
     with session("joints", rack, [bus], [0] * len(rack.devices), options) as process:

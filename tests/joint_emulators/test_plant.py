@@ -3,6 +3,8 @@
 import copy
 import math
 import re
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -398,3 +400,28 @@ def test_reset_needs_one_angle_for_each_joint() -> None:
     """Lengths are checked where it costs nothing."""
     with pytest.raises(JointEmulatorError, match="5 angles"):
         exoskeleton().reset([0.0] * 5)
+
+
+# The process
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="its C library has no function of that type")
+def test_stopwatch_at_rest_changes_no_motion() -> None:
+    """In a process of its own, whose MuJoCo then reads no clock any more: the same angles, to the last bit."""
+    program = """
+from joint_emulators.models.exoskeleton import JOINT_NAMES, USER_75KG, build_mjcf
+from joint_emulators.motor import MOTORS
+from joint_emulators.plant import Plant, rest_stopwatch
+
+rest_stopwatch()
+plant = Plant(build_mjcf(USER_75KG, MOTORS, False), JOINT_NAMES)
+for step in range(500):
+    plant.step([10.0, -5.0, 1.0, -10.0, 5.0, -1.0])
+print(plant.q)
+"""
+    told = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
+    plant = Plant(build_mjcf(USER_75KG, MOTORS, False), JOINT_NAMES)
+    for _ in range(500):
+        plant.step([10.0, -5.0, 1.0, -10.0, 5.0, -1.0])
+    assert told.strip() == str(plant.q)
+
