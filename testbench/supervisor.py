@@ -56,6 +56,9 @@ REFUSED: Final = 2
 
 _LOOK_NS: Final = 20 * MS
 
+_GATHER_NS: Final = 2 * MS
+"""How late the supervisor may hear what is on the buses; the stamps are not its own, and the rig needs the time."""
+
 
 @dataclass(frozen=True, slots=True)
 class Setup:
@@ -157,7 +160,9 @@ class Supervisor:
         for bus in self.buses:
             self._channels.append(open_bus(bus))
         record = setup.record or (setup.keep_parts and "gateway" in setup.without)
-        self._loop = RealTimeLoop(self.watch, self._channels, [0, 1], self._epoch_ns, record=record)
+        self._loop = RealTimeLoop(
+            self.watch, self._channels, [0, 1], self._epoch_ns, record=record, gather_ns=_GATHER_NS
+        )
         starts = {"joints": self._start_joints, "gateway": self._start_gateway, "hlc": self._start_hlc}
         for name in PARTS:
             if name in parts:

@@ -79,6 +79,7 @@ class RealTimeLoop:
 
     channels: the interfaces, numbers in the trace; ports[k]: index of the channel of the node's port k, several ports
     may share one. epoch_ns: time 0 on CLOCK_MONOTONIC. record: keep the trace. measure_latency: keep `latency`.
+    gather_ns: sleep so long before looking at what has come, for a node that only listens: stamps tell when it came.
     busy_poll: do not sleep until 10 ms after the last thing to read, which takes a core while frames come: waking up
     takes a machine longer than passing a frame on. clock, wait: for tests.
     trace: every frame in the order served, received ones with their stamp and sender RECEIVED, own ones with the time
@@ -95,6 +96,7 @@ class RealTimeLoop:
         *,
         record: bool = False,
         measure_latency: bool = False,
+        gather_ns: int = 0,
         busy_poll: bool = False,
         clock: Callable[[], int] = time.monotonic_ns,
         wait: Wait = wait_select,
@@ -117,6 +119,7 @@ class RealTimeLoop:
         self._lines: Final[list[Line]] = []
         self._readers: Final[dict[int, Callable[[int], None]]] = {}
         self._descriptors: list[int] = []
+        self._gather_ns: Final[int] = gather_ns
         self._busy_poll: Final[bool] = busy_poll
         self._awake_until: int = -NEVER
         for index, channel in enumerate(channels):
@@ -171,8 +174,9 @@ class RealTimeLoop:
         collecting = gc.isenabled()
         gc.disable()
         try:
-            while not until(self._clock() - self.epoch_ns):
-                self._turn()
+            now = self._clock() - self.epoch_ns
+            while not until(now):
+                now = self._turn(now, NEVER)
         finally:
             for line in self._lines:
                 line.channel.count_overruns()
@@ -181,22 +185,31 @@ class RealTimeLoop:
 
     def poll(self) -> None:
         """Serve once what is due and what has come, without waiting."""
-        self._turn(0)
-
-    def _turn(self, longest_ns: int = _CHECK_NS) -> None:
-        """Wait once, `longest_ns` at most, then serve everything that is due."""
-        writers: list[int] = []
         now = self._clock() - self.epoch_ns
-        until = self._prepare(now, now + longest_ns, writers)
+        self._turn(now, now)
+
+    def _turn(self, now: int, latest: int) -> int:
+        """Wait once, until `latest` and 50 ms at most, then serve everything that is due; returns when that began.
+
+        now: of the turn before. Where no wake-up is due soon the clock need not be asked how long to wait.
+        """
+        node = self._node
+        if self._gather_ns and latest == NEVER:
+            now = self._clock() - self.epoch_ns
+            self._wait([], [], max(min(self._gather_ns, node.wake_at - now), 0) / SECOND)
+        if node.wake_at - now <= 2 * _CHECK_NS:
+            now = self._clock() - self.epoch_ns
+        writers: list[int] = []
+        until = self._prepare(now, min(now + _CHECK_NS, latest), writers)
         readable, writable = self._wait(self._descriptors, writers, (until - now) / SECOND)
         now = self._clock() - self.epoch_ns
         if readable and self._busy_poll:
             self._awake_until = now + _AWAKE_NS
         left = self._drain(now, readable) if self._short_cut is None else self._short_cut.serve(now, readable)
         if left:
-            self._serve_arrivals(left)
-        if self._node.wake_at <= now:
-            self._serve_wakes(now)
+            self._serve_arrivals(left, now)
+        if node.wake_at <= now:
+            self._serve_wakes(now, -NEVER if readable else now)
         if self._out.echoes:
             self._serve_echoes()
         for line in self._lines:
@@ -207,6 +220,7 @@ class RealTimeLoop:
                 callback = self._readers.get(fd)
                 if callback is not None:
                     callback(self.now())
+        return now
 
     def _prepare(self, now: int, latest: int, writers: list[int]) -> int:
         """Fill in what to wait for; returns until when, `latest` at most."""
@@ -244,8 +258,8 @@ class RealTimeLoop:
             found.append(channel.receive() if is_due else [])
         return found
 
-    def _serve_arrivals(self, found: list[list[Arrival]]) -> None:
-        """Serve what came on each channel in order."""
+    def _serve_arrivals(self, found: list[list[Arrival]], now: int) -> None:
+        """Serve what came on each channel in order. now: before it was read."""
         first_line = -1
         batches: list[tuple[int, int, int, Arrival]] = []
         for index, arrivals in enumerate(found):
@@ -259,7 +273,9 @@ class RealTimeLoop:
             _number(batches, index, arrivals)
         if first_line < 0:
             return
-        latest = self.now()
+        latest = now
+        if any(arrivals[-1].stamp_ns > now for arrivals in found if arrivals):
+            latest = self.now()
         if batches:
             batches.sort()
             for _, index, _, arrival in batches:
@@ -318,12 +334,13 @@ class RealTimeLoop:
         for port in line.ports:
             self._node.port_changed(now, PortState(port, state.state, state.tec, state.rec, state.cause), self._out)
 
-    def _serve_wakes(self, limit: int) -> None:
-        """Serve every wake-up due up to and including `limit`."""
+    def _serve_wakes(self, limit: int, now: int = -NEVER) -> None:
+        """Serve every wake-up due up to and including `limit`. now: the time, where it has just been asked for."""
         node = self._node
         at = node.wake_at
         while at <= limit:
-            self.lateness.add(self.now() - at)
+            self.lateness.add((self.now() if now == -NEVER else now) - at)
+            now = -NEVER
             if at > self._out.served_ns:
                 self._out.served_ns = at
             node.wake(at, self._out)

@@ -84,13 +84,30 @@ def test_comparison_that_was_interrupted_does_not_spoil_the_difference_known(
     stamps = StampClock()
     counts = []
     for interrupted in (0, 0, 2, 0, 9):
-        clocks.pass_by(2 * MS)
+        clocks.pass_by(20 * MS)
         clocks.comparisons, clocks.interrupted = 0, interrupted
         stamps.begin(EPOCH)
         counts.append(clocks.comparisons)
         clocks.interrupted = 0
         assert abs(stamps.at(clocks.wall) - (clocks.monotonic - EPOCH)) <= cost_ns
     assert counts == [first, 1, 1, 1, 1]
+
+
+@pytest.mark.parametrize(("cost_ns", "comparisons"), [(100, 100), (20_000, 44), (500_000, 10)])
+def test_comparisons_take_one_percent_of_the_time_where_clocks_are_dear(
+    monkeypatch: pytest.MonkeyPatch, cost_ns: int, comparisons: int
+) -> None:
+    """Once a millisecond, more rarely where a clock is a system call that takes long, every 10 ms at least."""
+    clocks = SlowTime(cost_ns)
+    monkeypatch.setattr(channel, "time", clocks)
+    stamps = StampClock()
+    stamps.begin(EPOCH)
+    end = clocks.monotonic + 100 * MS
+    clocks.comparisons = 0
+    while clocks.monotonic < end:
+        clocks.pass_by(100_000)
+        stamps.begin(EPOCH)
+    assert clocks.comparisons == pytest.approx(comparisons, rel=0.15)
 
 
 def test_difference_found_by_interrupted_comparisons_is_corrected(monkeypatch: pytest.MonkeyPatch) -> None:
