@@ -28,7 +28,7 @@ _PLACES: Final = pytest.StashKey[pytest.TempPathFactory]()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """`--exo-bus`, `--exo-scenario`, `--exo-set`, `--exo-without`."""
+    """`--exo-bus`, `--exo-scenario`, `--exo-set`, `--exo-without`, `--exo-fifo`."""
     group = parser.getgroup("exo-hil", "exoskeleton rig under test (exo-hil)")
     group.addoption(
         "--exo-bus",
@@ -54,6 +54,11 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         choices=PARTS,
         metavar="PART",
         help="joints, gateway or hlc is foreign hardware or software on the named buses; may be repeated",
+    )
+    group.addoption(
+        "--exo-fifo",
+        action="store_true",
+        help="against the clock: real-time scheduling (SCHED_FIFO) for the processes of the rig, where permitted",
     )
 
 
@@ -171,7 +176,7 @@ def _open(request: pytest.FixtureRequest) -> "Exo":
             return open_lockstep(scenario, goldens, without)
         from testbench.plugin.realtime import RealTimeExo
 
-        return RealTimeExo(scenario, bus, buses, without, goldens)
+        return RealTimeExo(scenario, bus, buses, without, goldens, fifo=config.getoption("--exo-fifo"))
     except (BenchError, CanopenExoError, FaultError) as error:
         wrong = str(error)
     pytest.fail(f"exo: {wrong}", pytrace=False)  # out here, so that pytest does not show the same line as its cause

@@ -89,7 +89,7 @@ class RealTimeGateway(GatewayControl):
 
 @final
 class RealTimeExo(Exo):
-    """A rig of processes. buses: of controller and drives, None for an own hub; without: parts that are foreign."""
+    """A rig of processes. buses: of controller and drives, None for an own hub; without: foreign parts; fifo: as Setup."""
 
     def __init__(
         self,
@@ -98,10 +98,11 @@ class RealTimeExo(Exo):
         buses: tuple[str, str] | None,
         without: frozenset[str],
         goldens: Goldens,
+        fifo: bool = False,
     ) -> None:
         self._injectors: Final = RealTimeGateway(scenario)
         super().__init__(scenario, bus, self._injectors, goldens)
-        self._setup: Final[Setup] = Setup(scenario, buses, without, record=True)
+        self._setup: Final[Setup] = Setup(scenario, buses, without, record=True, fifo=fifo)
         self._stack: Final = contextlib.ExitStack()
         self._rig: Supervisor | None = None
         self._rows: list[Transmission] = []

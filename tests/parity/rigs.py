@@ -16,7 +16,7 @@ from testbench.child import ProcessError
 from testbench.parts import HlcPart, JointsPart, read_gateway, read_hlc, read_joints
 from testbench.process import ENDED_EARLY
 from testbench.scenario import JOINT_NAMES
-from testbench.supervisor import REACT_NS, Setup, Supervisor
+from testbench.supervisor import REACT_NS, Supervisor
 from tests.parity.patience import Late, Patience, distributions, gave_up_late
 from tests.parity.walks import Bench
 
@@ -106,7 +106,7 @@ class Aftermath:
 
 def kill(bench: Bench, name: str) -> Aftermath | Late:
     """Walk, kill, wait for the supervisor to notice, and end the rest. Nothing is left over, late or not."""
-    with nothing_left(Supervisor(Setup(bench.scenario(), bench.buses, keep_parts=True))) as rig:
+    with nothing_left(Supervisor(bench.setup())) as rig:
         rig.start()
         late = walk(rig)
         if late is not None:

@@ -26,13 +26,13 @@ seed: 1
 SHORT = "motion: {gait: walking, stride: 1.5 s, duration: 0.5 s}"
 
 
-def make_six_runs(bench: Bench, options: list[str], folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def make_six_runs(bench: Bench, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Six rows, each judged or invalid for lateness; asked again, nothing is made. Skips when all of them were late."""
     text = bench.text("freeze").replace("motion: {gait: walking, stride: 1.5 s, duration: 2.5 s}", SHORT)
     (folder / "walk.yaml").write_text(text.replace("time: 1 s", "time: 0.1 s"))
     (folder / "six.yaml").write_text(CAMPAIGN)
     store = folder / "six.sqlite"
-    command = ["campaign", "run", str(folder / "six.yaml"), "--realtime", *options, "--out", str(store), "--json"]
+    command = ["campaign", "run", str(folder / "six.yaml"), "--realtime", *bench.options, "--out", str(store), "--json"]
     code = main([*command, "--no-report"])
     made: dict[str, Any] = json.loads(capsys.readouterr().out)
     assert (made["made"], made["done"], made["wanted"]) == (6, 6, 6)

@@ -53,10 +53,11 @@ _FAULTS: Final = {
 @final
 @dataclass(frozen=True, slots=True)
 class Bench:
-    """Where it walks. buses: of controller and drives, None for an own hub; rate_hz: of SYNC."""
+    """Where it walks. buses: of controller and drives, None for an own hub; rate_hz: of SYNC; fifo: as Setup."""
 
     buses: tuple[str, str] | None
     rate_hz: int
+    fifo: bool = False
 
     @property
     def cycle_ns(self) -> int:
@@ -75,6 +76,16 @@ class Bench:
     def scenario(self, name: str = "none") -> Scenario:
         """As read from that file."""
         return parse_scenario(self.text(name))
+
+    def setup(self, name: str = "none", without: frozenset[str] = frozenset()) -> Setup:
+        """A rig for it whose processes leave their parts."""
+        return Setup(self.scenario(name), self.buses, without, keep_parts=True, fifo=self.fifo)
+
+    @property
+    def options(self) -> list[str]:
+        """The same place on the command line of `run --realtime`, `up` and `campaign run --realtime`."""
+        named = [] if self.buses is None else ["--controller-bus", self.buses[0], "--drive-bus", self.buses[1]]
+        return [*named, *(["--fifo"] if self.fifo else [])]
 
 
 @final
@@ -119,7 +130,7 @@ def make_walks(bench: Bench, patience: Patience) -> Walks:
         if name in skipped:
             raise skipped[name]
         if name not in made:
-            setup = Setup(bench.scenario(name), bench.buses, keep_parts=True)
+            setup = bench.setup(name)
             try:
                 real = patience.until_punctual(lambda: attempt_run(setup))
             except pytest.skip.Exception as error:

@@ -141,4 +141,4 @@ def test_injectors_are_armed_over_live_control_and_act_as_the_scenario_says() ->
 @pytest.mark.realtime
 def test_campaign_of_six_runs_on_the_hub(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """`campaign run --realtime`: the same file, one run after another, resumed like any other."""
-    make_six_runs(HUB, [], tmp_path, capsys)
+    make_six_runs(HUB, tmp_path, capsys)

@@ -39,7 +39,7 @@ def test_a_users_test_runs_on_vcan(tmp_path: Path, patience: Patience) -> None:
     file = tmp_path / "test_hil.py"
     file.write_text(HIL, encoding="utf-8")
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider"]
-    command += ["--exo-bus=vcan", "--exo-set=rig.rate=50Hz"]
+    command += ["--exo-bus=vcan", "--exo-set=rig.rate=50Hz", "--exo-fifo"]
     environment = {key: value for key, value in os.environ.items() if not key.startswith(("PYTEST_", "EXO_HIL_"))}
 
     def attempt() -> Late | None:

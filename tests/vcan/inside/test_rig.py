@@ -6,7 +6,6 @@ import signal
 from collections import Counter
 from importlib.resources import as_file, files
 from pathlib import Path
-from typing import Final
 
 import can
 import canopen
@@ -15,7 +14,7 @@ import pytest
 from canopen_exo import plan as ids
 from canopen_exo.cia402 import DriveState
 from testbench.cli import FAIL, INVALID, PASS
-from testbench.supervisor import Setup, Supervisor
+from testbench.supervisor import Supervisor
 from tests.parity.patience import Late, Patience, gave_up_late, is_lateness
 from tests.parity.rigs import check_killed, heard
 from tests.vcan.inside.peers import wait_until
@@ -27,9 +26,6 @@ pytestmark = [pytest.mark.realtime, pytest.mark.usefixtures("nothing_left")]
 # --- the command line ------------------------------------------------------------------------------------------------
 
 
-BUS_OPTIONS: Final = ("--controller-bus", "socketcan:vcan0", "--drive-bus", "socketcan:vcan1")
-
-
 def test_run_realtime_on_vcan_with_a_fault_gives_verdict_and_result_folder(
     tmp_path: Path, patience: Patience
 ) -> None:
@@ -39,7 +35,7 @@ def test_run_realtime_on_vcan_with_a_fault_gives_verdict_and_result_folder(
 
     def attempt() -> Program | Late:
         shutil.rmtree(out, ignore_errors=True)
-        program = Program(["run", str(scenario), "--realtime", *BUS_OPTIONS, "--out", str(out)], tmp_path)
+        program = Program(["run", str(scenario), "--realtime", *VCAN.options, "--out", str(out)], tmp_path)
         try:
             code = program.wait(90)
         finally:
@@ -73,7 +69,7 @@ def test_rig_on_vcan_ends_in_order_with_ctrl_c(tmp_path: Path, patience: Patienc
     scenario.write_text(VCAN.text())
 
     def attempt() -> Program | Late:
-        rig = Program(["up", str(scenario), *BUS_OPTIONS, "--control", str(control)], tmp_path)
+        rig = Program(["up", str(scenario), *VCAN.options, "--control", str(control)], tmp_path)
         try:
             wait_until(lambda: "running; Ctrl-C stops" in rig.printed or rig.code is not None, "it runs", 60)
             running, is_there = our_processes(), control.exists()
@@ -107,7 +103,7 @@ def test_canopen_master_on_vcan_moves_a_knee(patience: Patience) -> None:
     """The canopen package in place of our controller: it reads the PDO mapping from the drives and works by names."""
 
     def attempt() -> Late | None:
-        setup = Setup(VCAN.scenario(), VCAN.buses, without=frozenset({"hlc"}))
+        setup = VCAN.setup(without=frozenset({"hlc"}))
         with as_file(files("dbc") / "exo_joint.eds") as eds, Supervisor(setup) as rig:
             rig.start()
             late = move_the_knee(rig, str(eds))
