@@ -89,7 +89,7 @@ class RealTimeGateway(GatewayControl):
 
 @final
 class RealTimeExo(Exo):
-    """A rig of processes. buses: of controller and drives, None for an own hub; without: foreign parts; fifo: as Setup."""
+    """A rig of processes. buses: of controller and drives, None for an own hub; without, fifo: as Setup."""
 
     def __init__(
         self,
