@@ -323,11 +323,13 @@ def build_injectors(
     if problems:
         raise FaultError("\n".join(problems))
     if recorded is None:
-        return [_build(name, spec, plan, stream(seed, run, name)) for name, spec in specs.items()]
+        return [build_injector(name, spec, plan, seed, run) for name, spec in specs.items()]
     return [_replay(name, spec, plan, stream(seed, run, name), recorded.get(name, ())) for name, spec in specs.items()]
 
 
-def _build(name: str, spec: InjectorSpec, plan: BusPlan, rng: Generator) -> Injector:
+def build_injector(name: str, spec: InjectorSpec, plan: BusPlan, seed: int, run: int) -> Injector:
+    """One that has been checked together with the others, see `check_injectors`."""
+    rng = stream(seed, run, name)
     place = spec.place(plan)
     return Injector(
         name,

@@ -24,7 +24,8 @@ from typing import TYPE_CHECKING, Final, final
 from canopen_exo.bus.channel import Channel
 from canopen_exo.bus.interfaces import BusName, open_channel, parse_bus
 from canopen_exo.bus.node import MS, NEVER, SECOND, Node
-from canopen_exo.bus.realtime import RealTimeLoop, request_fifo
+from canopen_exo.bus.realtime import RealTimeLoop
+from canopen_exo.bus.scheduling import release_fifo, request_fifo
 from canopen_exo.errors import CanopenExoError
 from testbench.errors import BenchError
 
@@ -126,6 +127,7 @@ class Session:
         self.start_ns: Final[int] = (self.loop.now() // MS + 1) * MS
         self._channels: Final[list[Channel]] = channels
         self._supervisor: Final[int] = options.supervisor
+        self._fifo: Final[bool] = options.fifo
         self._look_at: int = 0
         self._told: Final[set[str]] = set()
 
@@ -143,6 +145,8 @@ class Session:
         self.loop.run(over)
         if self.loop.trace is not None:
             self._read_out()
+        if self._fifo:
+            release_fifo()  # what comes now, writing the part, is not to hold up the others
         self._warn()
 
     def _read_out(self) -> None:

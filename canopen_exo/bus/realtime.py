@@ -34,10 +34,10 @@ from canopen_exo.bus.medium import Transmission
 from canopen_exo.bus.node import MS, NEVER, SECOND, Node, PortState, Relay
 from canopen_exo.bus.realtime_out import Line, RealTimeOut
 from canopen_exo.bus.realtime_relay import ShortCut
-from canopen_exo.bus.scheduling import request_fifo, sharpen_timers
+from canopen_exo.bus.scheduling import sharpen_timers
 from canopen_exo.errors import CanopenExoError
 
-__all__ = ["RECEIVED", "Lateness", "Readable", "RealTimeLoop", "RealTimeOut", "request_fifo"]
+__all__ = ["RECEIVED", "Lateness", "Readable", "RealTimeLoop", "RealTimeOut"]
 
 RECEIVED: Final = -1
 """`Transmission.sender` of a frame that came from outside; own frames have the node's port there."""

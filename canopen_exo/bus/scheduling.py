@@ -30,6 +30,12 @@ def request_fifo() -> str | None:
     return None
 
 
+def release_fifo() -> None:
+    """Normal scheduling again, for work that may wait for others."""
+    if hasattr(os, "sched_setscheduler"):
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+
+
 def sharpen_timers() -> None:
     """Waits of this thread end at most 1 us later than asked for, as far as the machine can."""
     if sys.platform == "linux":

@@ -10,7 +10,8 @@ from canopen_exo.bus.frame import Frame
 from canopen_exo.bus.node import MS, NEVER, SECOND, Out
 from canopen_exo.plan import BusPlan, JointNode
 from canopen_exo.signal import Signal
-from fi_gateway.addition import Additions, plain
+from fi_gateway import boundary
+from fi_gateway.addition import Additions, plain, read_injector
 from fi_gateway.bus_control import BusControl
 from fi_gateway.control import LiveControl
 from fi_gateway.control_socket import answer_request
@@ -292,3 +293,11 @@ def test_plain_keeps_what_a_file_can_hold() -> None:
     """Tuples become lists, keys texts; everything else is shown to the schema as text."""
     assert plain({"a": (1, 2.5, None, True), 3: {"b": []}}) == {"a": [1, 2.5, None, True], "3": {"b": []}}
     assert plain({1}) == "{1}"
+
+
+def test_the_first_addition_finds_all_checks_prepared() -> None:
+    """Preparing them takes 0.1 s, and no frame passes meanwhile: it is over when there is something to add to."""
+    live()
+    before = boundary._made_once.cache_info().misses
+    read_injector("bias", plain(BIAS), {}, PLAN)
+    assert boundary._made_once.cache_info().misses == before

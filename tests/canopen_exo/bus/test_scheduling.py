@@ -4,7 +4,7 @@ import os
 
 import pytest
 
-from canopen_exo.bus.scheduling import request_fifo, sharpen_timers
+from canopen_exo.bus.scheduling import release_fifo, request_fifo, sharpen_timers
 
 
 def test_refused_fifo_gives_one_line_with_the_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -38,6 +38,15 @@ def test_system_without_fifo_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     message = request_fifo()
     assert message is not None
     assert "no SCHED_FIFO" in message
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_getscheduler"), reason="this system has no SCHED_FIFO")
+def test_what_was_granted_is_given_back() -> None:
+    """Real: asked for where it is permitted, and normal afterwards either way."""
+    granted = request_fifo() is None
+    assert os.sched_getscheduler(0) == (os.SCHED_FIFO if granted else os.SCHED_OTHER)
+    release_fifo()
+    assert os.sched_getscheduler(0) == os.SCHED_OTHER
 
 
 def test_timers_can_be_sharpened_any_number_of_times() -> None:
