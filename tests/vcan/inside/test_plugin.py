@@ -16,6 +16,7 @@ from canopen_exo.cia402 import DriveState
 
 
 def test_a_biased_knee(exo):
+    golden = exo.golden  # made before the rig moves
     exo.run_until_motion()
     fault = exo.gateway.inject(
         target={"bus": "to_controller", "node": "right_knee", "signal": "position"},
@@ -25,6 +26,7 @@ def test_a_biased_knee(exo):
     exo.run_until(lambda: fault.row.manifested > 5, within="2 s")
     exo.run_until(lambda: not fault.is_active, within="2 s")
     assert 0 < exo.deviation("right_knee").rmse_position_rad < 0.1
+    assert exo.golden is golden
     exo.send(0x123, b"ab", bus="drive")
     exo.expect(0x123, data=b"ab", within="1 s", bus="controller")
     exo.gateway.inject(target={"bus": "to_drives", "pdo": "RPDO1"}, fault={"type": "drop"})
@@ -35,11 +37,14 @@ def test_a_biased_knee(exo):
 
 @pytest.mark.realtime
 def test_a_users_test_runs_on_vcan(tmp_path: Path, patience: Patience) -> None:
-    """docs/pytest.md: the words of lock-step mean the same on vcan. A machine that is too busy skips."""
+    """docs/pytest.md: the words of lock-step mean the same on vcan. A machine that is too busy skips.
+
+    It walks longer than usual: what a test does between two waits takes some seconds in User Mode Linux.
+    """
     file = tmp_path / "test_hil.py"
     file.write_text(HIL, encoding="utf-8")
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider"]
-    command += ["--exo-bus=vcan", "--exo-set=rig.rate=50Hz", "--exo-fifo"]
+    command += ["--exo-bus=vcan", "--exo-set=rig.rate=50Hz", "--exo-set=motion.duration=12 s", "--exo-fifo"]
     environment = {key: value for key, value in os.environ.items() if not key.startswith(("PYTEST_", "EXO_HIL_"))}
 
     def attempt() -> Late | None:
