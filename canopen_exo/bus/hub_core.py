@@ -341,6 +341,8 @@ class Hub:
                     return
                 bus = self._admit(client, data, now)
                 at = LONG
+            if bus.wake_at <= now:  # a hub held up: what ended before these bytes came was followed by what waited then
+                bus.wake(now)
             used = at + bus.carry(client, data[at:] if at else data, now)
         except HubRecordError as error:
             self.refuse(client, str(error))

@@ -6,7 +6,17 @@ from hypothesis import strategies as st
 
 from canopen_exo.bus.bits import frame_bits
 from canopen_exo.bus.frame import FLAG_EXTENDED, FLAG_FD, FLAG_REMOTE, Frame
-from canopen_exo.bus.hub_core import CONFIRM_EVERY, MAX_BUSES, OUTBOX_LIMIT, Client, Hub, TimedBus
+from canopen_exo.bus.hub_core import (
+    CONFIRM_EVERY,
+    MAX_BUSES,
+    OUTBOX_LIMIT,
+    Client,
+    Hub,
+    MakeBus,
+    SharedBus,
+    TimedBus,
+)
+from canopen_exo.bus.hub_errors import ErrorBus
 from canopen_exo.bus.hub_wire import (
     FLAG_ERROR,
     FLAG_OWN,
@@ -304,6 +314,29 @@ def test_late_wake_up_moves_no_frame(bitrate: int) -> None:
     assert isinstance(bus, TimedBus)
     assert bus.lateness.count == QUEUE_LENGTH
     assert bus.lateness.worst_ns == 1000 * MBIT - ends[0]
+
+
+def error_bus(name: str, index: int, bitrate: int, _now: int) -> SharedBus:
+    """One on which errors could happen."""
+    return ErrorBus(name, index, bitrate, [])
+
+
+@pytest.mark.parametrize("make", [None, error_bus])
+def test_frame_that_comes_to_a_late_hub_does_not_start_before_it_came(make: MakeBus | None) -> None:
+    """It waits from when it came on, behind what was on the wire and what had waited: not in the gap before."""
+    hub = Hub(MBIT, make)
+    sender, receiver = join(hub), join(hub)
+    hub.received(sender, pack_frame(Frame(0x181, bytes(8))) + pack_frame(Frame(0x301, bytes(8))), 0)
+    hub.settle(0)
+    came = 5 * MBIT
+    hub.received(sender, pack_frame(Frame(0x081, bytes(8))), came)  # lower than what waits, and 5 ms later
+    hub.settle(came)
+    hub.wake(10 * MBIT)
+    got = frames(receiver)
+    assert [frame.can_id for _, frame in got] == [0x181, 0x301, 0x081]
+    first, second, third = (end for end, _ in got)
+    assert second < 2 * first + 10_000
+    assert third == came + frame_bits(0x081, bytes(8), False, False, 8) * 1000
 
 
 class Script(Node):
