@@ -12,6 +12,7 @@ import os
 import threading
 import time
 from collections.abc import Mapping
+from concurrent.futures import CancelledError
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
@@ -150,12 +151,15 @@ class Cluster(Executor):
         Raises ExecutorError when the scheduler is gone, or a worker has other code, or none that can make runs.
         """
         if self._flying:
-            with suppress(TimeoutError), self._client.as_current():
-                distributed.wait(list(self._flying), timeout=timeout_s, return_when="FIRST_COMPLETED")
+            try:
+                with suppress(TimeoutError), self._client.as_current():
+                    distributed.wait(list(self._flying), timeout=timeout_s, return_when="FIRST_COMPLETED")
+            except CancelledError as error:  # all that was asked for, when the connection is lost
+                raise self._gone() from error
         elif timeout_s:
             time.sleep(timeout_s)
         if self._client.status not in ("running", "connecting"):
-            raise ExecutorError(f"--cluster {self._address}: the scheduler is gone; what was finished is in the store")
+            raise self._gone()
         done = [future for future in self._flying if future.status in ("finished", "error", "cancelled", "lost")]
         return [self._row(future, self._flying.pop(future)) for future in done]
 
@@ -169,6 +173,12 @@ class Cluster(Executor):
     def _last_heard(self) -> float:
         """When a worker last said that a run took too long, by the scheduler's clock: of a campaign before this one."""
         return max((float(time_s) for time_s, _ in self._client.get_events(HUNG)), default=0.0)
+
+    def _gone(self) -> ExecutorError:
+        return ExecutorError(
+            f"--cluster {self._address}: the scheduler is gone; what was finished is in the store: start the scheduler "
+            "and its workers again, and the same command goes on"
+        )
 
     def _no_worker(self) -> ExecutorError:
         return ExecutorError(

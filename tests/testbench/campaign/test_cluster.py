@@ -7,7 +7,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import distributed
@@ -18,6 +18,8 @@ from testbench.campaign.making.execute import Workshop, make_run
 from testbench.campaign.making.executor import Executor, ExecutorError
 from testbench.campaign.making.identity import code_version
 from testbench.campaign.records import Outcome, RunRow, RunSpec
+from testbench.campaign.store.store import open_store
+from tests.testbench.campaign.campaigns import written
 from tests.testbench.campaign.specs import spec
 
 ROOT = Path(__file__).parents[3]
@@ -25,8 +27,16 @@ MAKERS = "tests.testbench.campaign.cluster_makers"
 WORKERS = 2
 
 
+@dataclass(frozen=True)
+class Dask:
+    """A cluster of this machine. address: of its scheduler; scheduler: the process."""
+
+    address: str
+    scheduler: subprocess.Popen[bytes]
+
+
 @contextmanager
-def dask_cluster(folder: Path, workers: int) -> Iterator[str]:
+def dask_cluster(folder: Path, workers: int) -> Iterator[Dask]:
     """A scheduler and workers; one that dies is started again by its nanny, and its run is tried three times."""
     place = folder / "scheduler.json"
     environment = {
@@ -48,7 +58,7 @@ def dask_cluster(folder: Path, workers: int) -> Iterator[str]:
                 while not place.exists():
                     with suppress(subprocess.TimeoutExpired):
                         pytest.fail(f"scheduler left with {processes[0].wait(0.05)}: {(folder / 'log').read_text()}")
-            yield str(json.loads(place.read_text())["address"])
+            yield Dask(str(json.loads(place.read_text())["address"]), processes[0])
         finally:
             for process in reversed(processes):
                 with suppress(ProcessLookupError):
@@ -60,9 +70,9 @@ def dask_cluster(folder: Path, workers: int) -> Iterator[str]:
 def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """Of a cluster with two workers that are ready."""
     with dask_cluster(tmp_path_factory.mktemp("cluster"), WORKERS) as found:
-        with distributed.Client(found, set_as_default=False) as client:
+        with distributed.Client(found.address, set_as_default=False) as client:
             client.wait_for_workers(WORKERS, timeout=120)
-        yield found
+        yield found.address
 
 
 def rows_of(executor: Executor, specs: list[RunSpec]) -> dict[str, RunRow]:
@@ -92,6 +102,47 @@ def test_rows_are_those_of_this_machine(address: str) -> None:
     here = {one.identity: make_run(one, workshop) for one in specs}
     there = rows_of(Cluster(address), specs)
     assert {name: plain(row) for name, row in there.items()} == {name: plain(row) for name, row in here.items()}
+
+
+@pytest.mark.run
+def test_campaign_from_the_command_line_is_that_of_this_machine(address: str, tmp_path: Path) -> None:
+    """`campaign run FILE --cluster tcp://HOST:PORT`: plan and store here, runs there; again, it has nothing to make."""
+    file = written(tmp_path, ("runs: 3", "runs: 2"))
+    command = [sys.executable, "-m", "testbench.cli", "campaign", "run", str(file), "--no-report", "--json", "--out"]
+    stores = {"cluster": ["--cluster", address], "jobs": ["--jobs", "1"], "again": ["--cluster", address]}
+    documents, rows = {}, {}
+    for name, where in stores.items():
+        store = tmp_path / ("cluster.sqlite" if name == "again" else f"{name}.sqlite")
+        done = subprocess.run([*command, str(store), *where], capture_output=True, text=True, timeout=300)
+        assert done.returncode == 0, done.stderr
+        documents[name] = json.loads(done.stdout)
+        rows[name] = [replace(plain(row), versions={}) for row in stored(store)]
+    assert [documents[name]["made"] for name in stores] == [4, 4, 0]
+    assert rows["cluster"] == rows["jobs"] == rows["again"]
+    assert len(rows["jobs"]) == 4
+
+
+def stored(path: Path) -> list[RunRow]:
+    store = open_store(path)
+    try:
+        return list(store.runs.all())
+    finally:
+        store.close()
+
+
+@pytest.mark.run
+def test_scheduler_that_is_gone_ends_the_campaign(tmp_path: Path) -> None:
+    """In the middle of a run: said within the patience of the client, and what was finished is there."""
+    with dask_cluster(tmp_path, 1) as dask:
+        executor = Cluster(dask.address, f"{MAKERS}:hanging")
+        executor.submit(replace(spec("golden"), identity="under way", time_limit_s=600.0))
+        assert executor.collect(0.5) == []
+        os.killpg(dask.scheduler.pid, signal.SIGKILL)
+        try:
+            with pytest.raises(ExecutorError, match="the scheduler is gone; what was finished is in the store"):
+                executor.collect(60.0)
+        finally:
+            executor.stop()
 
 
 @pytest.mark.run
@@ -169,7 +220,7 @@ def test_cluster_without_workers_is_said_with_its_remedy(tmp_path: Path, monkeyp
         dask_cluster(tmp_path, 0) as empty,
         pytest.raises(ExecutorError, match=r"no worker there for 0\.2 s; .* dask worker tcp://127"),
     ):
-        Cluster(empty)
+        Cluster(empty.address)
 
 
 def test_complaints_about_workers_name_the_remedy() -> None:
