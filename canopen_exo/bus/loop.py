@@ -150,8 +150,9 @@ class Loop:
                     if medium.is_special:
                         if waiting or medium.is_restless:
                             medium.arbitrate(now)
-                            wake = self._first_wake()
-                            bound = wake if wake <= until else until + 1
+                            if medium.is_watched or medium.end == NEVER:  # then its Wiring may want to be woken
+                                wake = self._first_wake()
+                                bound = wake if wake <= until else until + 1
                         at = medium.end
                         if at == NEVER:
                             continue

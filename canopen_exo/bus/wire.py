@@ -81,37 +81,34 @@ class Wire(Wiring):
 
     def start(self, now: int) -> None:
         """Begin the next attempt, or put it off while those who want to send have to wait."""
-        medium = self.medium
-        first: tuple[Frame, Port] | None = None
+        waiting = self.medium.waiting
         if self._is_calm:
-            first = medium.waiting[0]
+            self._begin(now, waiting[0], 0)
+            return
+        self._settle(now)
+        for offer in self._offers(now):
+            self._begin(now, offer, waiting.index(offer))
+            return
+        if self.medium.is_restless:
+            self._attempt(now, [], self._ask(now, now + MARGIN * self.medium.bit_ns, None, -1))
         else:
-            self._settle(now)
-            for offer in self._offers(now):
-                first = offer
-                break
-            if first is None and not medium.is_restless:
-                self._plan_wake(now + 1)
-                return
-        frame: Frame | None = None
-        bits, sender = 0, -1
-        if first is not None:
-            frame, port = first
-            sender = port.number
-            bits = frame.bits
-            if bits == 0:
-                bits = frame.measure()
-        disruptions = self._ask(now, now + (bits + MARGIN) * medium.bit_ns, frame, sender)
-        if first is None or disruptions or self._unsettled or self._is_contested(first):
+            self._plan_wake(now + 1)
+
+    def _begin(self, now: int, first: tuple[Frame, Port], at: int) -> None:
+        """An attempt that the frame wins which waits at place `at`: nearly always one that nothing disturbs."""
+        medium = self.medium
+        frame, port = first
+        bits = frame.bits or frame.measure()
+        bit_ns = medium.bit_ns
+        disruptions: list[Disruption] = []
+        if self.disturbances:
+            disruptions = self._ask(now, now + (bits + MARGIN) * bit_ns, frame, port.number)
+        if disruptions or self._unsettled or self._is_contested(frame, port):
             self._attempt(now, self._offers(now), disruptions)
             return
-        waiting = medium.waiting
-        if waiting[0] is first:
-            waiting.pop(0)
-        else:
-            waiting.remove(first)
+        medium.waiting.pop(at)
         medium.on_wire = first
-        medium.end = now + bits * medium.bit_ns
+        medium.end = now + bits * bit_ns
         medium.is_watched = self._is_charged or not self._is_calm
         self._started_ns = now
 
@@ -126,13 +123,15 @@ class Wire(Wiring):
                 self._suspects.append((disturbance, min([one.first for one in found])))
         return disruptions
 
-    def _is_contested(self, first: tuple[Frame, Port]) -> bool:
+    def _is_contested(self, frame: Frame, port: Port) -> bool:
         """Nobody is there to acknowledge, or another port begins with the same arbitration bits."""
         medium = self.medium
         if len(medium.ports) - self._states.absent < 2:
             return True
-        frame, port = first
-        for other, rival in medium.waiting:
+        waiting = medium.waiting
+        if len(waiting) == 1 or (self._is_calm and waiting[1][0].arbitration != frame.arbitration):
+            return False
+        for other, rival in waiting:
             if other.arbitration > frame.arbitration:
                 break
             if rival is not port and rival.ready_ns <= port.ready_ns:
