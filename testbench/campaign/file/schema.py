@@ -40,6 +40,7 @@ MOST_POINTS: Final = 20_000
 MOST_RUNS: Final = 1_000_000
 
 _KEYS: Final = frozenset({"scenario", "axes", "runs", "search", "filter", "traces", "stop_early"})
+_SCENARIO_KEYS: Final = frozenset({"rig", "motion", "injectors"})
 
 
 def _wall(given: int) -> int:
@@ -156,6 +157,9 @@ def load_campaign(path: Path | str, changes: Sequence[str] = (), runs: int | Non
     Raises FileErrors with everything that is wrong.
     """
     document = load(path)
+    if isinstance(document.data, dict) and _SCENARIO_KEYS & document.data.keys() and not is_campaign(document.data):
+        told = f"this is a scenario; `exo-hil run {path}` runs it, a campaign file names it (docs/campaigns.md)"
+        raise FileErrors([f"{path}: {told}"])
     text = Path(path).read_text(encoding="utf-8-sig")
     return campaign_in(document, text, changes, runs)
 

@@ -254,6 +254,7 @@ def test_export_writes_all_runs(tmp_path: Path, fake: Callable[[str], None]) -> 
         (["report", "nothing.sqlite"], "no such file"),
         (["run", "small.yaml", "--out", "small.yaml/s.sqlite"], "give another place with --out"),
         (["run", "small.yaml", "--set", "rig.stop=on"], "--set rig.stop=on: "),
+        (["run", str(Path(__file__).parents[3] / "scenarios" / "golden.yaml")], "golden.yaml: this is a scenario; `exo-hil run "),
     ],
 )
 def test_bad_usage_exits_2_with_one_clear_line(
