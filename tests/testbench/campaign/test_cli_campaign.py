@@ -55,6 +55,8 @@ def interrupt(process: subprocess.Popen[str]) -> None:
     """Ctrl-C as a terminal has it: for the program and all of its processes."""
     os.killpg(process.pid, signal.SIGINT)
 
+GOLDEN = str(Path(__file__).parents[3] / "scenarios" / "golden.yaml")
+
 
 def rows_in(path: Path) -> list[RunRow]:
     store = open_store(path)
@@ -254,7 +256,7 @@ def test_export_writes_all_runs(tmp_path: Path, fake: Callable[[str], None]) -> 
         (["report", "nothing.sqlite"], "no such file"),
         (["run", "small.yaml", "--out", "small.yaml/s.sqlite"], "give another place with --out"),
         (["run", "small.yaml", "--set", "rig.stop=on"], "--set rig.stop=on: "),
-        (["run", str(Path(__file__).parents[3] / "scenarios" / "golden.yaml")], "golden.yaml: this is a scenario; `exo-hil run "),
+        (["run", GOLDEN], "golden.yaml: this is a scenario; `exo-hil run "),
     ],
 )
 def test_bad_usage_exits_2_with_one_clear_line(
