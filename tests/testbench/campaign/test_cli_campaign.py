@@ -34,6 +34,7 @@ if __name__ == "__main__":
     sys.exit(main(sys.argv[2:]))
 """
 
+GOLDEN = str(Path(__file__).parents[3] / "scenarios" / "golden.yaml")
 TIMES = {"started": "", "wall_s": 0.0, "cpu_s": 0.0, "attempts": 1}
 
 
@@ -54,8 +55,6 @@ def exo_hil(folder: Path, *arguments: str, maker: str = "") -> subprocess.Popen[
 def interrupt(process: subprocess.Popen[str]) -> None:
     """Ctrl-C as a terminal has it: for the program and all of its processes."""
     os.killpg(process.pid, signal.SIGINT)
-
-GOLDEN = str(Path(__file__).parents[3] / "scenarios" / "golden.yaml")
 
 
 def rows_in(path: Path) -> list[RunRow]:
