@@ -50,6 +50,7 @@ CORE: Final = (
     "canopen_exo/sdo.py",
     "canopen_exo/signal.py",
     "canopen_exo/sync.py",
+    "canopen_exo/write_rules.py",
     "fi_gateway/activation.py",
     "fi_gateway/conditions.py",
     "fi_gateway/distributions.py",

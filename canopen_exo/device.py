@@ -26,20 +26,17 @@ from canopen_exo.emcy import (
 from canopen_exo.heartbeat import HeartbeatConsumer, HeartbeatProducer, heartbeat_frame
 from canopen_exo.nmt import NmtCommand, NmtSlave, NmtState, decode_nmt
 from canopen_exo.od import ObjectDictionary, WriteObserver
-from canopen_exo.pdo import INVALID, PDO_COUNT, ReceivePdo, TransmitPdo, is_restricted, key_of, mapping_abort
+from canopen_exo.pdo import PDO_COUNT, ReceivePdo, TransmitPdo, key_of
 from canopen_exo.plan import HEARTBEAT, SDO_ANSWER, SDO_REQUEST, SYNC
 from canopen_exo.sdo import SdoServer
 from canopen_exo.sync import SyncConsumer
+from canopen_exo.write_rules import check_write
 
 BOOT_NS: Final = 5 * MS
 """Time from reset to the boot-up message (assumed)."""
 
 SYNC_LOSS_CYCLES: Final = 5
 """SYNC periods (0x1006) of silence after which SYNC counts as lost (this project's drives)."""
-
-ABORT_DEVICE_STATE: Final = 0x08000022
-ABORT_INCOMPATIBLE: Final = 0x06040043
-ABORT_VALUE_RANGE: Final = 0x06090030
 
 ERROR_REGISTER: Final = key_of(0x1001, 0)
 
@@ -426,43 +423,7 @@ class _Rules(WriteObserver):
 
     def check(self, key: int, raw: int) -> int:
         """The abort code, 0 when the write may happen."""
-        device, index, sub = self.device, key >> 8, key & 0xFF
-        values = device.od.values
-        if index == 0x1019 and values[key_of(0x1006, 0)]:
-            return ABORT_DEVICE_STATE  # CiA 301, object 0x1019: not while the communication cycle period is set
-        if index == 0x1019 and (raw == 1 or raw > 240):
-            return ABORT_VALUE_RANGE
-        if index == 0x1016 and sub and raw >> 16 & 0xFF and raw & 0xFFFF:
-            for other in range(1, values[key_of(0x1016, 0)] + 1):
-                word = values[key_of(0x1016, other)]
-                if other != sub and word & 0xFFFF and word >> 16 & 0xFF == raw >> 16 & 0xFF:
-                    return ABORT_INCOMPATIBLE
-        if 0x1400 <= index < 0x1400 + PDO_COUNT or 0x1800 <= index < 0x1800 + PDO_COUNT:
-            return self._check_communication(index, sub, raw)
-        if 0x1600 <= index < 0x1600 + PDO_COUNT or 0x1A00 <= index < 0x1A00 + PDO_COUNT:
-            return self._check_mapping(index, sub, raw)
-        return device.application.check(key, raw)
-
-    def _check_communication(self, index: int, sub: int, raw: int) -> int:
-        if sub == 1 and not raw & INVALID and is_restricted(raw & 0x3FFFFFFF):
-            return ABORT_VALUE_RANGE
-        if sub == 2 and index >= 0x1800 and not 1 <= raw <= 240:
-            return ABORT_VALUE_RANGE  # transmit types other than synchronous cyclic are not there
-        if sub == 2 and index < 0x1800 and 240 < raw < 254:
-            return ABORT_VALUE_RANGE
-        enabled = not self.device.od.values[key_of(index, 1)] & INVALID
-        if sub == 6 and enabled:
-            return ABORT_DEVICE_STATE  # CiA 301, 18xx:6: only while the PDO is not valid
-        return 0
-
-    def _check_mapping(self, index: int, sub: int, raw: int) -> int:
-        """The standard procedure: clear :0, write the entries, set :0 to their number."""
-        od = self.device.od
-        if sub == 0:
-            return mapping_abort(od, index, raw)
-        if od.values[key_of(index, 0)]:
-            return ABORT_DEVICE_STATE
-        return 0
+        return check_write(self.device.od, key, raw) or self.device.application.check(key, raw)
 
     def written(self, key: int, raw: int) -> None:
         """Carry the new value to where it acts."""
