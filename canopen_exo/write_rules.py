@@ -6,11 +6,10 @@ Leaves out: what the object dictionary itself refuses (size, access, range), and
 
 from typing import Final
 
-from canopen_exo.od import ABORT_DEVICE_STATE, ObjectDictionary
+from canopen_exo.od import ABORT_DEVICE_STATE, ABORT_VALUE, ObjectDictionary
 from canopen_exo.pdo import INVALID, PDO_COUNT, is_restricted, key_of, mapping_abort
 
 ABORT_INCOMPATIBLE: Final = 0x06040043
-ABORT_VALUE_RANGE: Final = 0x06090030
 
 
 def check_write(od: ObjectDictionary, key: int, raw: int) -> int:
@@ -20,7 +19,7 @@ def check_write(od: ObjectDictionary, key: int, raw: int) -> int:
     if index == 0x1019 and values[key_of(0x1006, 0)]:
         return ABORT_DEVICE_STATE  # CiA 301, object 0x1019: not while the communication cycle period is set
     if index == 0x1019 and (raw == 1 or raw > 240):
-        return ABORT_VALUE_RANGE
+        return ABORT_VALUE
     if index == 0x1016 and sub and raw >> 16 & 0xFF and raw & 0xFFFF:
         for other in range(1, values[key_of(0x1016, 0)] + 1):
             word = values[key_of(0x1016, other)]
@@ -35,11 +34,11 @@ def check_write(od: ObjectDictionary, key: int, raw: int) -> int:
 
 def _check_communication(od: ObjectDictionary, index: int, sub: int, raw: int) -> int:
     if sub == 1 and not raw & INVALID and is_restricted(raw & 0x3FFFFFFF):
-        return ABORT_VALUE_RANGE
+        return ABORT_VALUE
     if sub == 2 and index >= 0x1800 and not 1 <= raw <= 240:
-        return ABORT_VALUE_RANGE  # transmit types other than synchronous cyclic are not there
+        return ABORT_VALUE  # transmit types other than synchronous cyclic are not there
     if sub == 2 and index < 0x1800 and 240 < raw < 254:
-        return ABORT_VALUE_RANGE
+        return ABORT_VALUE
     if sub == 6 and not od.values[key_of(index, 1)] & INVALID:
         return ABORT_DEVICE_STATE  # CiA 301, 18xx:6: only while the PDO is not valid
     return 0
