@@ -6,15 +6,18 @@ from pathlib import Path
 
 import pytest
 
-from canopen_exo.bus.node import NEVER
+from canopen_exo.bus.node import NEVER, SECOND
 from fi_gateway.control_socket import Listing
 from fi_gateway.errors import FaultError
+from fi_gateway.schema import build_injectors
 from testbench.campaign.making import over_bus
+from testbench.campaign.making.execute import LOOK_NS, Pair, Workshop, judged, make_run
 from testbench.campaign.making.executor import FolderError
 from testbench.campaign.making.over_bus import OverBus, Rigging, arm, check_scenario
 from testbench.campaign.records import Outcome, RunRow, RunSpec
 from testbench.errors import BenchError
 from testbench.realtime_run import RealTimeRun
+from testbench.run import judge_pair, rig_params, run_rig
 from testbench.scenario import parse_scenario
 from testbench.supervisor import Setup
 from tests.parity.patience import BUSY, is_lateness
@@ -23,6 +26,7 @@ from tests.parity.walks import Bench
 from tests.testbench.campaign.specs import spec
 
 HUB = Bench(None, 100)
+LONGER = [f"injectors.{name}.effect.duration=1 s" for name in ("freeze_position", "zero_velocity")]
 
 
 def scenario_with(injector: str) -> str:
@@ -53,6 +57,29 @@ def test_faults_from_power_up_are_refused_because_they_are_armed_later() -> None
 def test_wire_faults_are_refused_with_what_they_need() -> None:
     with pytest.raises(FaultError, match=r"injectors\.one\.fault: exo-hil campaign run --realtime cannot do no_ack"):
         check_scenario(parse_scenario(scenario_with(WIRE)), Rigging())
+
+
+@pytest.mark.run
+@pytest.mark.parametrize("grace_s", [0.0, 0.2])
+def test_run_that_walks_on_is_judged_as_if_it_had_ended_at_its_failure(grace_s: float) -> None:
+    """stop_early over the bus: what the same run gives in lock-step, where it really ends there."""
+    asked = spec("knee_freeze_at", "motion.duration=6s", *LONGER, grace_s=grace_s)
+    scenario = parse_scenario(asked.scenario)
+    injectors = build_injectors(scenario.injectors, scenario.plan, scenario.seed, 0)
+    golden, whole = run_rig(rig_params(scenario), [])[0], run_rig(rig_params(scenario), injectors)[0]
+    record = over_bus._ended(whole, asked, scenario, golden)
+    assert record.duration_ns < whole.duration_ns == 6 * SECOND
+    early = make_run(asked, Workshop())
+    assert early.failure_s is not None
+    assert early.ended_s is not None
+    assert record.duration_ns == pytest.approx((early.failure_s + grace_s) * 1e9, abs=1e6)
+    assert 0 <= early.ended_s * 1e9 - record.duration_ns <= LOOK_NS  # which looks for failures now and then
+    cut = replace(record, duration_ns=round(early.ended_s * 1e9))
+    row = judged(asked, scenario, Pair(golden, "", cut, ""), judge_pair(scenario, golden, cut))
+    assert row.outcome is early.outcome is Outcome.FAILURE_SILENT
+    assert row.metrics == pytest.approx(early.metrics)
+    assert row.injections == early.injections
+    assert over_bus._ended(whole, replace(asked, stop_on=None), scenario, golden) is whole
 
 
 def test_campaign_without_our_gateway_is_refused() -> None:
