@@ -11,7 +11,8 @@ from fi_gateway.control_socket import Listing
 from fi_gateway.errors import FaultError
 from fi_gateway.schema import build_injectors
 from testbench.campaign.making import over_bus
-from testbench.campaign.making.execute import LOOK_NS, Pair, Workshop, judged, make_run
+from testbench.campaign.making.early import LOOK_NS
+from testbench.campaign.making.execute import Pair, Workshop, judged, make_run
 from testbench.campaign.making.executor import FolderError
 from testbench.campaign.making.over_bus import OverBus, Rigging, arm, check_scenario
 from testbench.campaign.records import Outcome, RunRow, RunSpec
@@ -78,7 +79,8 @@ def test_run_that_walks_on_is_judged_as_if_it_had_ended_at_its_failure(grace_s: 
     row = judged(asked, scenario, Pair(golden, "", cut, ""), judge_pair(scenario, golden, cut))
     assert row.outcome is early.outcome is Outcome.FAILURE_SILENT
     assert row.metrics == pytest.approx(early.metrics)
-    assert row.injections == early.injections
+    starts = [[(one.injector, one.start_s) for one in made.injections] for made in (row, early)]
+    assert starts[0] == starts[1]
     assert over_bus._ended(whole, replace(asked, stop_on=None), scenario, golden) is whole
 
 
