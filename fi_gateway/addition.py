@@ -23,20 +23,21 @@ _FIRST: Final[Data] = {
     "effect": {"type": "once"},
 }
 
+
 @final
 class Additions:
-    """The injectors of one rig, and more of them. specs: by name, in the order in which they act; seed: of the run.
-
-    What it takes to read the first one, some 0.1 s of preparing the checks, is done here: while a gateway reads one
-    that is given to it, no frame passes.
-    """
+    """The injectors of one rig, and more of them. specs: by name, in the order in which they act; seed: of the run."""
 
     def __init__(self, specs: Mapping[str, InjectorSpec], plan: BusPlan, seed: int) -> None:
         self.specs: dict[str, InjectorSpec] = dict(specs)
         self._plan: Final[BusPlan] = plan
         self._seed: Final[int] = seed
+
+    def prepare(self) -> None:
+        """Prepare the checks, which takes 0.1 s the first time: while a gateway reads an injector, no frame passes."""
         with contextlib.suppress(FaultError):
-            read_injector("first", _FIRST, {}, plan)
+            first = read_injector("first", _FIRST, {}, self._plan)
+            read_injector("second", _FIRST, {"first": first, **self.specs}, self._plan)
 
     def read(self, name: str, given: object) -> None:
         """One more, for a gateway to be made. given: its keys in a scenario file. FaultError has all complaints."""

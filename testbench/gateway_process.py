@@ -99,6 +99,7 @@ def gateway_main(
         server = _server(given.control, control, process)
         with closing(server) if server is not None else nullcontext():
             if server is not None:
+                additions.prepare()
                 server.listen()
                 server.attach(process.loop)
                 say("gateway", f"live control at {server.address}")
@@ -106,7 +107,7 @@ def gateway_main(
                     say("gateway", f"warning: {server.address} can be reached from other machines")
             say("gateway", f"between {buses[0]} (controller) and {buses[1]} (drives); {_injectors_text(gateway)}")
             is_valid = _serve(process, control, server, server is not None or given.frames is not None, additions)
-        gateway.finish(process.loop.now())
+        gateway.finish(process.end_ns)
         if options.part is not None:
             _leave_part(options, process, control)
         directions = statistics(gateway, process.loop.latency, process.loop.losses_by_channel())
@@ -222,7 +223,7 @@ def _serve(
         orders = process.orders
         if orders.interrupts and not interrupted:
             interrupted = True
-            control.pass_through(now, "signal")
+            control.pass_through(process.loop.now(), "signal")
             say("gateway", f"injection is stopped, frames pass on; {how}, Ctrl-C ends")
         return orders.terminations > 0 or orders.interrupts > 1
 

@@ -108,10 +108,20 @@ class Orders:
 
 @final
 class Session:
-    """A node on its interfaces. start_ns: loop time from which it is served."""
+    """A node on its interfaces. start_ns, end_ns: loop time from which and until which it is served.
+
+    has_fifo: real-time scheduling was granted, for as long as it is served.
+    """
 
     def __init__(
-        self, name: str, node: Node, channels: list[Channel], ports: list[int], options: ProcessOptions, orders: Orders
+        self,
+        name: str,
+        node: Node,
+        channels: list[Channel],
+        ports: list[int],
+        options: ProcessOptions,
+        orders: Orders,
+        has_fifo: bool,
     ) -> None:
         self.name: Final[str] = name
         self.orders: Final[Orders] = orders
@@ -125,9 +135,10 @@ class Session:
             busy_poll=options.busy_poll,
         )
         self.start_ns: Final[int] = (self.loop.now() // MS + 1) * MS
+        self.end_ns: int = self.start_ns
         self._channels: Final[list[Channel]] = channels
         self._supervisor: Final[int] = options.supervisor
-        self._fifo: Final[bool] = options.fifo
+        self._has_fifo: Final[bool] = has_fifo
         self._look_at: int = 0
         self._told: Final[set[str]] = set()
 
@@ -145,7 +156,8 @@ class Session:
         self.loop.run(over)
         if self.loop.trace is not None:
             self._read_out()
-        if self._fifo:
+        self.end_ns = self.loop.now()
+        if self._has_fifo:
             release_fifo()  # what comes now, writing the part, is not to hold up the others
         self._warn()
 
@@ -185,7 +197,7 @@ class Session:
         """How it was served, for its part."""
         from testbench.parts import Service
 
-        return Service(self.start_ns, self.loop.now(), self.loop.lateness, self.losses())
+        return Service(self.start_ns, self.end_ns, self.loop.lateness, self.losses())
 
 
 @contextmanager
@@ -199,13 +211,12 @@ def session(
         with orders.taken():
             if options.supervisor:
                 die_with(options.supervisor)
-            if options.fifo:
-                refusal = request_fifo()
-                if refusal is not None:
-                    say(name, refusal)
+            refusal = request_fifo() if options.fifo else None
+            if refusal is not None:
+                say(name, refusal)
             for bus in buses:
                 channels.append(open_bus(bus))
-            yield Session(name, node, channels, ports, options, orders)
+            yield Session(name, node, channels, ports, options, orders, options.fifo and refusal is None)
     finally:
         for channel in channels:
             channel.close()

@@ -57,7 +57,7 @@ REFUSED: Final = 2
 _LOOK_NS: Final = 20 * MS
 
 _GATHER_NS: Final = 2 * MS
-"""How late the supervisor may hear what is on the buses; the stamps are not its own, and the rig needs the time."""
+"""How late the supervisor may hear what is on the buses, where frames come with their times; the rig needs the time."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -179,6 +179,7 @@ class HubServer:
         if data:
             self.hub.received(client, data, time.monotonic_ns())
         else:
+            self.hub.wake(time.monotonic_ns())
             self.hub.left(client)
             connection.is_finished = True
         if client.refusal:

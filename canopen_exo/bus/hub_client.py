@@ -244,6 +244,7 @@ class HubChannel(Channel):
 
     def __init__(self, channel: str) -> None:
         super().__init__(f"hub:{channel}")
+        self.is_stamped = True
         self._link: Final = HubLink(channel, 0)
         self._state: PortState = PortState(0, ErrorState.DOWN, 0, 0, "not open")
         self._notices: list[Arrival] = []

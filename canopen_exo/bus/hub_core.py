@@ -330,6 +330,7 @@ class Hub:
         """Bytes came from a client at `now` [ns]."""
         if client.refusal or not data:
             return
+        self.wake(now)  # of a hub held up: what ended before these bytes came was followed by what waited then
         if client.inbox:
             data = client.inbox + data
         try:
@@ -341,8 +342,6 @@ class Hub:
                     return
                 bus = self._admit(client, data, now)
                 at = LONG
-            if bus.wake_at <= now:  # a hub held up: what ended before these bytes came was followed by what waited then
-                bus.wake(now)
             used = at + bus.carry(client, data[at:] if at else data, now)
         except HubRecordError as error:
             self.refuse(client, str(error))

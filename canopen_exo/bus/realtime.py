@@ -16,7 +16,8 @@ keeps the stamp). Deviation from the lock-step order: within one channel frames 
 where stamps are equal; on a real bus no two frames end at once.
 Automatic garbage collection rests while the loop runs: one full collection over a long trace takes tens of
 milliseconds, and the core makes no reference cycles. The thread's timer slack is set to 1 us.
-Leaves out: signals (the caller's matter, `until` is asked at least every 50 ms), and when a sent frame really left
+Leaves out: signals (the caller's matter, `until` is asked at least every 50 ms, with the time at which the turn began),
+and when a sent frame really left
 the controller: its trace row has the time at which it was handed over.
 """
 
@@ -79,7 +80,8 @@ class RealTimeLoop:
 
     channels: the interfaces, numbers in the trace; ports[k]: index of the channel of the node's port k, several ports
     may share one. epoch_ns: time 0 on CLOCK_MONOTONIC. record: keep the trace. measure_latency: keep `latency`.
-    gather_ns: sleep so long before looking at what has come, for a node that only listens: stamps tell when it came.
+    gather_ns: sleep so long before looking at what has come, for a node that is in no hurry; not where a channel stamps
+    frames when they are read.
     busy_poll: do not sleep until 10 ms after the last thing to read, which takes a core while frames come: waking up
     takes a machine longer than passing a frame on. clock, wait: for tests.
     trace: every frame in the order served, received ones with their stamp and sender RECEIVED, own ones with the time
@@ -119,7 +121,7 @@ class RealTimeLoop:
         self._lines: Final[list[Line]] = []
         self._readers: Final[dict[int, Callable[[int], None]]] = {}
         self._descriptors: list[int] = []
-        self._gather_ns: Final[int] = gather_ns
+        self._gather_ns: Final[int] = gather_ns if all(channel.is_stamped for channel in channels) else 0
         self._busy_poll: Final[bool] = busy_poll
         self._awake_until: int = -NEVER
         for index, channel in enumerate(channels):
@@ -191,17 +193,18 @@ class RealTimeLoop:
     def _turn(self, now: int, latest: int) -> int:
         """Wait once, until `latest` and 50 ms at most, then serve everything that is due; returns when that began.
 
-        now: of the turn before. Where no wake-up is due soon the clock need not be asked how long to wait.
+        now: of the turn before. Where nothing is due for a second the clock need not be asked how long to wait.
         """
         node = self._node
         if self._gather_ns and latest == NEVER:
             now = self._clock() - self.epoch_ns
             self._wait([], [], max(min(self._gather_ns, node.wake_at - now), 0) / SECOND)
-        if node.wake_at - now <= 2 * _CHECK_NS:
-            now = self._clock() - self.epoch_ns
         writers: list[int] = []
-        until = self._prepare(now, min(now + _CHECK_NS, latest), writers)
-        readable, writable = self._wait(self._descriptors, writers, (until - now) / SECOND)
+        check_at = now + _CHECK_NS
+        until = self._prepare(now, min(check_at, latest), writers)
+        if until != check_at or node.wake_at < now + SECOND:
+            now = self._clock() - self.epoch_ns
+        readable, writable = self._wait(self._descriptors, writers, max(until - now, 0) / SECOND)
         now = self._clock() - self.epoch_ns
         if readable and self._busy_poll:
             self._awake_until = now + _AWAKE_NS
@@ -209,7 +212,7 @@ class RealTimeLoop:
         if left:
             self._serve_arrivals(left, now)
         if node.wake_at <= now:
-            self._serve_wakes(now, -NEVER if readable else now)
+            self._serve_wakes(now, -NEVER if readable or left else now)
         if self._out.echoes:
             self._serve_echoes()
         for line in self._lines:

@@ -3,6 +3,7 @@
 Source: sched(7), prctl(2).
 """
 
+import contextlib
 import ctypes
 import os
 import sys
@@ -33,7 +34,8 @@ def request_fifo() -> str | None:
 def release_fifo() -> None:
     """Normal scheduling again, for work that may wait for others."""
     if hasattr(os, "sched_setscheduler"):
-        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+        with contextlib.suppress(OSError):
+            os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
 def sharpen_timers() -> None:

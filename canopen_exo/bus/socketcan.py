@@ -179,6 +179,7 @@ class SocketCanChannel(RecordChannel):
 
     def __init__(self, name: str, open_socket: Callable[[], socket.socket]) -> None:
         super().__init__(name)
+        self.is_stamped = True
         self._open_socket: Final = open_socket
         self._stamps: Final = StampClock()
         self._receiver: Final = Receiver()

@@ -297,7 +297,11 @@ def test_plain_keeps_what_a_file_can_hold() -> None:
 
 def test_the_first_addition_finds_all_checks_prepared() -> None:
     """Preparing them takes 0.1 s, and no frame passes meanwhile: it is over when there is something to add to."""
-    live()
+    boundary._made_once.cache_clear()
+    additions = Additions({}, PLAN, 7)
+    additions.read("other", plain(BIAS))
+    additions.prepare()
     before = boundary._made_once.cache_info().misses
-    read_injector("bias", plain(BIAS), {}, PLAN)
+    assert before > 0
+    read_injector("flip", plain({**BIAS, "fault": {"type": "bit_flip", "count": 3}}), additions.specs, PLAN)
     assert boundary._made_once.cache_info().misses == before

@@ -409,6 +409,8 @@ def test_reset_needs_one_angle_for_each_joint() -> None:
 def test_stopwatch_at_rest_changes_no_motion() -> None:
     """In a process of its own, whose MuJoCo then reads no clock any more: the same angles, to the last bit."""
     program = """
+import mujoco
+
 from joint_emulators.models.exoskeleton import JOINT_NAMES, USER_75KG, build_mjcf
 from joint_emulators.motor import MOTORS
 from joint_emulators.plant import Plant, rest_stopwatch
@@ -417,6 +419,7 @@ rest_stopwatch()
 plant = Plant(build_mjcf(USER_75KG, MOTORS, False), JOINT_NAMES)
 for step in range(500):
     plant.step([10.0, -5.0, 1.0, -10.0, 5.0, -1.0])
+assert mujoco.get_mjcb_time() is not None
 print(plant.q)
 """
     told = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
@@ -424,4 +427,3 @@ print(plant.q)
     for _ in range(500):
         plant.step([10.0, -5.0, 1.0, -10.0, 5.0, -1.0])
     assert told.strip() == str(plant.q)
-

@@ -12,7 +12,6 @@ import os
 import threading
 import time
 from collections.abc import Mapping
-from concurrent.futures import CancelledError
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
@@ -24,6 +23,9 @@ from testbench.campaign.making.executor import Executor, ExecutorError, given_up
 from testbench.campaign.making.identity import code_version
 from testbench.campaign.making.worker import DEFAULT, Failed, MakeRun, made_or_failed, maker_named
 from testbench.campaign.records import Outcome, RunRow, RunSpec
+
+_LOST: Final = "scheduler-connection-lost"
+"""Why the client cancels all that was asked for, in distributed's words."""
 
 CONNECT_S: Final = 10.0
 """Most that the scheduler may take to answer."""
@@ -154,8 +156,9 @@ class Cluster(Executor):
             try:
                 with suppress(TimeoutError), self._client.as_current():
                     distributed.wait(list(self._flying), timeout=timeout_s, return_when="FIRST_COMPLETED")
-            except CancelledError as error:  # all that was asked for, when the connection is lost
-                raise self._gone() from error
+            except distributed.client.FuturesCancelledError as error:
+                if any(group.reason == _LOST for group in error.error_groups):
+                    raise self._gone() from error
         elif timeout_s:
             time.sleep(timeout_s)
         if self._client.status not in ("running", "connecting"):

@@ -339,6 +339,18 @@ def test_frame_that_comes_to_a_late_hub_does_not_start_before_it_came(make: Make
     assert third == came + frame_bits(0x081, bytes(8), False, False, 8) * 1000
 
 
+def test_client_that_joins_a_late_hub_acknowledges_nothing_from_before_it_came() -> None:
+    """A sender alone on the bus repeats its frame until then: some 130 us an attempt, error frame included."""
+    hub = Hub(MBIT, error_bus)
+    sender = join(hub)
+    hub.received(sender, pack_frame(Frame(0x181, bytes(8))), 0)
+    hub.settle(0)
+    hub.received(Client("joiner"), pack_hello("drive", 0), 5 * MBIT)
+    bus = hub.buses["drive"]
+    assert isinstance(bus, ErrorBus)
+    assert bus.medium.errors > 30
+
+
 class Script(Node):
     """Sends what it is told at given times."""
 

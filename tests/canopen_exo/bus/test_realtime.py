@@ -32,6 +32,7 @@ class FakeChannel(Channel):
         self.sent_at: list[int] = []
         self.reads: list[int] = []
         self.is_away = False
+        self.on_read: Callable[[], None] = lambda: None
 
     def fileno(self) -> int:
         return self.fd
@@ -41,6 +42,7 @@ class FakeChannel(Channel):
         self.poll_at = NEVER
         arrivals = self.inbox
         self.inbox = []
+        self.on_read()
         return arrivals
 
     def send(self, frame: Frame) -> bool:
@@ -72,6 +74,10 @@ class World:
     def clock(self) -> int:
         return EPOCH + self.now
 
+    def pass_by(self, time: int) -> None:
+        """Something takes its time."""
+        self.now += time
+
     def at(self, time: int, action: Callable[[], None]) -> None:
         self.events.append((time, len(self.events), action))
         self.events.sort()
@@ -85,7 +91,7 @@ class World:
         self.waits.append(timeout_s)
         if not any(self.ready_of(readers, writers)):
             end = self.now + round(timeout_s * 1e9)
-            if self.events and self.events[0][0] < end:
+            if self.events and self.events[0][0] < end and (readers or writers):
                 end = self.events[0][0]
             self.now = max(self.now, end)
         self.now += self.oversleep
@@ -105,6 +111,7 @@ class World:
         record: bool = False,
         measure_latency: bool = False,
         busy_poll: bool = False,
+        gather_ns: int = 0,
     ) -> RealTimeLoop:
         channels: list[Channel] = list(self.channels)
         return RealTimeLoop(
@@ -115,6 +122,7 @@ class World:
             record=record,
             measure_latency=measure_latency,
             busy_poll=busy_poll,
+            gather_ns=gather_ns,
             clock=self.clock,
             wait=self.wait,
         )
@@ -276,6 +284,81 @@ def test_lateness_is_time_served_minus_wake_at() -> None:
     assert node.rows == [("wake", MS, 0), ("wake", 2 * MS, 0)]
     assert (loop.lateness.count, loop.lateness.worst_ns) == (2, 1_250_000)
     assert loop.lateness.percentile(0.5) < 300_000  # the second was 250 us late; a bin is 12.5 % wide
+
+
+@pytest.mark.parametrize("fd", [10, -1])
+def test_lateness_counts_the_time_that_reading_took(fd: int) -> None:
+    """Also where a channel has no descriptor, and nothing was said to be readable."""
+    world = World()
+    channel = world.channels[0]
+    channel.fd = fd
+    node = Diary(5 * MS)
+
+    def arrive() -> None:
+        channel.inbox.append(Arrival(5 * MS, FRAMES[0], None))
+        channel.on_read = lambda: world.pass_by(700_000)
+
+    channel.poll_at = 5 * MS if fd < 0 else NEVER
+    world.at(5 * MS, arrive)
+    loop = world.loop(node, [0])
+    loop.run(until(world, 5 * MS))
+    assert node.rows[-1] == ("wake", 5 * MS, 0)
+    assert loop.lateness.worst_ns == 700_000
+
+
+def test_wait_ends_on_time_whatever_the_turn_before_took() -> None:
+    """What is due counts from the clock and not from the last turn: nothing is served late by the time of serving."""
+    world = World()
+    channel = world.channels[0]
+    channel.fd = -1
+    reads = [MS, 2 * MS, 3 * MS, 4 * MS]
+
+    def again() -> None:
+        world.pass_by(700_000)
+        channel.poll_at = reads[len(channel.reads)] if len(channel.reads) < len(reads) else NEVER
+
+    channel.poll_at = reads[0]
+    channel.on_read = again
+    world.loop(Diary(), [0]).run(until(world, 6 * MS))
+    assert channel.reads == reads
+
+
+def test_wake_up_after_a_long_turn_is_on_time() -> None:
+    """It was not due soon when the turn began."""
+    world = World()
+
+    class Slow(Diary):
+        def receive(self, now: int, port: int, frame: Frame, out: Out) -> None:
+            world.pass_by(80 * MS)
+            self.wake_at = 110 * MS
+
+    world.arrive(MS, 0, FRAMES[0])
+    loop = world.loop(Slow(), [0])
+    loop.run(until(world, 110 * MS))
+    assert (loop.lateness.count, loop.lateness.worst_ns) == (1, 0)
+
+
+def test_listener_in_no_hurry_reads_what_came_meanwhile_at_once() -> None:
+    """Every 2 ms at most, and its wake-ups are on time; it handles each frame with its stamp."""
+    world = World()
+    world.channels[0].is_stamped = True
+    node = Diary(7 * MS)
+    for number in range(20):
+        world.arrive(10 * MS + number * 100_000, 0, FRAMES[0])
+    loop = world.loop(node, [0], gather_ns=2 * MS)
+    loop.run(until(world, 30 * MS))
+    assert [row[1] for row in node.rows if row[0] == "frame"] == [10 * MS + number * 100_000 for number in range(20)]
+    assert len(world.channels[0].reads) <= 3
+    assert loop.lateness.worst_ns == 0
+
+
+def test_listener_reads_at_once_what_gets_its_time_by_reading() -> None:
+    """Gathering would change the times of frames there."""
+    world = World()
+    for number in range(5):
+        world.arrive(10 * MS + number * 100_000, 0, FRAMES[0])
+    world.loop(Diary(), [0], gather_ns=2 * MS).run(until(world, 20 * MS))
+    assert world.channels[0].reads == [10 * MS + number * 100_000 for number in range(5)]
 
 
 def test_until_is_asked_every_50_ms() -> None:
