@@ -185,7 +185,7 @@ def summary_text(document: Summary) -> str:
     load = ", ".join(f"{name} bus {100 * bus['load']:.0f} %" for name, bus in document["bus"].items())
     heading = document["verdict"].upper() if document["valid"] else "INVALID"
     head = [
-        f"{heading}  {document['scenario']}, seed {document['seed']}: {_outcome_text(document)}",
+        f"{heading}  {document['scenario']}, seed {document['seed']}: {_outcome_text(document)}{_unmet_text(document)}",
         f"      {document['sim_time_s']:.1f} s simulated in {document['wall_time_s']:.2f} s "
         f"({document['x_realtime']:.1f} x real time); {load}",
         *_real_time_lines(document),
@@ -204,6 +204,14 @@ def summary_text(document: Summary) -> str:
     injections = _injection_lines(document)
     room = max(MOST_LINES - len(head) - len(tail) - 1, 1)
     return "\n".join([*head, injections[0], *_few(injections[1:], room, "injections"), *tail]) + "\n"
+
+
+def _unmet_text(document: Summary) -> str:
+    """What fails a run in which nothing else did."""
+    unmet = sum(not entry["met"] for entry in document["expectations"])
+    if not unmet or document["failures"] or not document["valid"]:
+        return ""
+    return f"; {unmet} of {len(document['expectations'])} expectations not met"
 
 
 def _real_time_lines(document: Summary) -> list[str]:

@@ -379,16 +379,17 @@ def test_defect_of_the_program_is_no_verdict(
 
 @pytest.mark.run
 @pytest.mark.parametrize(
-    ("expectation", "code", "verdict"), [("injections == 0", 0, "PASS"), ("injections == 1", 1, "FAIL")]
+    ("expectation", "code", "verdict", "why"),
+    [("injections == 0", 0, "PASS", ""), ("injections == 1", 1, "FAIL", "; 1 of 1 expectations not met")],
 )
 def test_exit_code_is_the_verdict(
-    place: Path, capsys: pytest.CaptureFixture[str], expectation: str, code: int, verdict: str
+    place: Path, capsys: pytest.CaptureFixture[str], expectation: str, code: int, verdict: str, why: str
 ) -> None:
     """0 pass, 1 fail, as for an `expect:` line that is met or not; without --json the text says so first."""
     short = ["--set", "motion.duration=0.1s", "--set", f"expect=[{expectation}]"]
     assert main(["run", GOLDEN, *short]) == code
     captured = capsys.readouterr()
-    assert captured.out.startswith(f"{verdict}  golden, seed 2020: no fault was activated\n")
+    assert captured.out.startswith(f"{verdict}  golden, seed 2020: no fault was activated{why}\n")
     folder = default_folder("golden", 2020, short[1::2])
     assert folder != default_folder("golden", 2020)  # a changed scenario does not replace the result of the file
     assert captured.err == f"result folder: {place / folder}\n"
