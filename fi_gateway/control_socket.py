@@ -136,7 +136,7 @@ class ControlServer:
             self.close()
             raise FaultError(
                 f"live control: cannot listen at {self._address}: {error.strerror or error}; stop what runs there, or "
-                "give another address"
+                "give another address with --control"
             ) from error
 
     def attach(self, readers: Readers) -> None:

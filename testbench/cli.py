@@ -173,6 +173,11 @@ def _run(options: argparse.Namespace) -> int:
     _print(summary_json(result.document) if options.json else summary_text(result.document))
     _say(f"result folder: {written}")
     if not result.document["valid"]:
+        timing = result.document.get("realtime")
+        if timing is not None and timing["late_cycles"]:
+            from testbench.watch import too_busy
+
+            _say(too_busy(scenario.plan.cycle_ns))
         return INVALID
     return PASS if result.judgement.passed else FAIL
 

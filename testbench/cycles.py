@@ -67,7 +67,7 @@ class CycleJudge:
         due_ns = self.zero_ns + (cycle + 1) * self.cycle_ns if is_ours else begun_ns + self.cycle_ns
         if is_ours and row.frame.can_id != ids.SYNC:
             due_ns = max(due_ns, syncs.get(cycle + 1, due_ns))
-        self._note(cycle, row.end_ns - due_ns, f"{what} {row.frame.can_id:03X}")
+        self._note(cycle, row.end_ns - due_ns, f"{what} COB-ID {row.frame.can_id:03X}")
 
     def miss(self, cycle: int, what: str) -> None:
         """Something that this cycle owes was never sent: late by a whole cycle, there is no other measure of it."""
@@ -111,7 +111,7 @@ def judge_controller(
             continue
         for can_id in sorted(owed):
             if cycle not in sent.get(can_id, ()):
-                judge.miss(cycle, f"controller sent no {can_id:03X}")
+                judge.miss(cycle, f"controller sent no COB-ID {can_id:03X}")
 
 
 def _sync_of_zero(own: list[Transmission], syncs: list[int], zero_ns: int) -> int:
@@ -137,7 +137,7 @@ def judge_drives(judge: CycleJudge, rows: list[Transmission], answers: set[int],
                 judge.judge(rows[place], "joints sent", syncs)
         missing.get(can_id, set()).difference_update(causes.values())
     for place, can_id in sorted((place, can_id) for can_id, places in missing.items() for place in places):
-        judge.miss(judge.cycle(rows[place]), f"joints sent no {can_id:03X}")
+        judge.miss(judge.cycle(rows[place]), f"joints sent no COB-ID {can_id:03X}")
 
 
 def _matters(row: Transmission, answers: set[int]) -> bool:

@@ -25,6 +25,7 @@ from testbench.run import CHUNK_NS, LEAVE_NS, START_NS, Progress, Result, result
 from testbench.scenario import Scenario
 from testbench.supervisor import Setup, Supervisor, check_status_readers
 from testbench.timing import Timing, TimingLimits, judge_timing
+from testbench.watch import too_busy
 
 TAIL_NS: Final = SECOND // 2
 """How long a rig without our controller is listened to after the motion."""
@@ -181,8 +182,11 @@ def _gather(rig: Supervisor, setup: Setup) -> RealTimeRun:
         record = merge(plan, duration_ns, hlc, gateway, joints, rig.rows)
     except IncompleteError as error:
         parts = {"hlc": hlc, "gateway": gateway, "joints": joints}
-        served = [f"{name} {part.service.lateness.words()}" for name, part in parts.items() if part is not None]
-        raise IncompleteError(f"{error}; wake-ups served late: {'; '.join(served)}") from error
+        lateness = {name: part.service.lateness for name, part in parts.items() if part is not None}
+        served = [f"{name} {one.words()}" for name, one in lateness.items() if one.count]
+        is_late = any(one.worst_ns >= plan.cycle_ns // 2 for one in lateness.values())
+        remedy = f"; {too_busy(plan.cycle_ns)}" if is_late else ""
+        raise IncompleteError(f"{error}; wake-ups served late: {'; '.join(served)}{remedy}") from error
     zero = time_zero_of(plan, hlc, gateway, rig.rows)
     cycles = duration_ns // plan.cycle_ns if hlc is None else int(hlc.cycles.size)
     timing = judge_timing(

@@ -41,6 +41,14 @@ class Alarm:
         self.code: Final[int] = code
 
 
+def too_busy(cycle_ns: int) -> str:
+    """What to do about a rig that was late, in words."""
+    return (
+        f"this machine is too busy for {1e9 / cycle_ns:g} Hz: end what else runs on it, lower rig.rate (as with --set "
+        "rig.rate=100Hz), or try --fifo"
+    )
+
+
 @final
 class Watch(Node):
     """Port CONTROLLER_PORT and port DRIVE_PORT.
@@ -110,10 +118,9 @@ class Watch(Node):
         """What was late, for people; "" for a rig that kept time: no late cycle, no SYNC off by half a cycle."""
         if not self.late and self.worst_ns <= self.plan.cycle_ns // 2:
             return ""
-        rate_hz = 1e9 / self.plan.cycle_ns
         return (
             f"the rig was late: {self.late} of {self.cycles} cycles, SYNC off by at most {self.worst_ns / 1e6:.1f} ms; "
-            f"this machine is too busy for {rate_hz:g} Hz: end what else runs on it, lower rig.rate, or try --fifo"
+            f"{too_busy(self.plan.cycle_ns)}"
         )
 
     # --- listening -----------------------------------------------------------------------------------------------

@@ -73,8 +73,8 @@ def listen(host: str, port: int) -> socket.socket:
     except OSError as error:
         listener.close()
         raise CanopenExoError(
-            f"hub: cannot listen on {host}:{port}: {error.strerror}; stop what runs there, or give another port "
-            "(0: a free one)"
+            f"hub: cannot listen on {host}:{port}: {error.strerror}; stop what runs there, or give another port, as in "
+            f"--listen {host}:0 (0: a free one)"
         ) from error
     return listener
 

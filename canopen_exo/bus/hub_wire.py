@@ -220,9 +220,12 @@ def unpack_welcome(buffer: bytes) -> Welcome:
 
 
 def split_address(text: str) -> tuple[str, int]:
-    """`HOST:PORT`, `HOST`, `:PORT` or `[IPv6]:PORT` to host and port, with the defaults; raises CanopenExoError."""
+    """`HOST:PORT`, `HOST`, `PORT`, `:PORT` or `[IPv6]:PORT` to host and port, with the defaults.
+
+    A number alone is a port: as a host, 0 would be all interfaces of the machine. Raises CanopenExoError.
+    """
     host, colon, port = text.rpartition(":")
-    if not colon or text.endswith("]"):
+    if text.endswith("]") or not (colon or text.isdigit()):
         host, port = text, ""
     if host.startswith("[") and host.endswith("]"):
         host = host[1:-1]

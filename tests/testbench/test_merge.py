@@ -463,7 +463,7 @@ def test_answer_or_command_that_was_never_sent_makes_its_cycle_late(scenario: Sc
     )
     assert timing.lost == []
     assert timing.late == {70: CYCLE, 71: CYCLE, 72: CYCLE}
-    assert timing.worst == f"cycle 70, {who} sent no {cob_id:03X}"
+    assert timing.worst == f"cycle 70, {who} sent no COB-ID {cob_id:03X}"
 
 
 def test_drives_owe_no_answer_to_a_sync_that_a_fault_took(scenario: Scenario, parts: Parts) -> None:
@@ -516,7 +516,7 @@ def test_commands_late_by_more_than_the_cycle_has_left_make_it_late(
     timing = judged(scenario, replace(hlc, rows=rows), gateway, joints)
     assert list(timing.late) == [40] * late
     if late:
-        assert timing.worst.startswith("cycle 40, controller sent 2")
+        assert timing.worst.startswith("cycle 40, controller sent COB-ID 2")
         assert by_ns - 9 * MS < timing.late_worst_ns < by_ns - 7 * MS
 
 

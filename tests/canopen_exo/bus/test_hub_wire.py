@@ -238,6 +238,8 @@ def test_kinds_have_the_sizes_of_the_table() -> None:
         ("127.0.0.1:29536", ("127.0.0.1", 29536)),
         ("localhost", ("localhost", 29536)),
         (":0", ("127.0.0.1", 0)),
+        ("0", ("127.0.0.1", 0)),
+        ("29540", ("127.0.0.1", 29540)),
         ("", ("127.0.0.1", 29536)),
         ("[::1]:5", ("::1", 5)),
         ("[::1]", ("::1", 29536)),
@@ -249,7 +251,7 @@ def test_address_is_split_with_the_defaults(text: str, address: tuple[str, int])
     assert split_address(text) == address
 
 
-@pytest.mark.parametrize("text", ["localhost:x", "localhost:65536", "localhost:-1", "localhost:²"])
+@pytest.mark.parametrize("text", ["localhost:x", "localhost:65536", "99999", "localhost:-1", "localhost:²"])
 def test_port_that_is_none_is_refused(text: str) -> None:
     """The message has the value and what is allowed."""
     with pytest.raises(CanopenExoError, match=r"port '.*' given, allowed 0\.\.65535"):
