@@ -91,6 +91,8 @@ def gateway_main(
     if given.faults:
         refuse_wire_faults(faults.injectors, "exo-hil gateway")
     additions = Additions(faults.injectors if given.faults else {}, faults.plan, faults.seed)
+    if given.control:
+        additions.prepare()
     gateway = Gateway(additions.built(), faults.plan.cycle_ns)
     control = LiveControl(gateway, additions)
     if given.frames is not None:
@@ -99,7 +101,6 @@ def gateway_main(
         server = _server(given.control, control, process)
         with closing(server) if server is not None else nullcontext():
             if server is not None:
-                additions.prepare()
                 server.listen()
                 server.attach(process.loop)
                 say("gateway", f"live control at {server.address}")
