@@ -68,7 +68,7 @@ lint: $(READY) ## ruff, mypy --strict, import contracts
 	$(BIN)/python -m mypy
 	$(BIN)/lint-imports --no-logo
 
-unit: $(READY) ## the tests that need no whole run and no clock, on WORKERS=2 processes: a minute
+unit: $(READY) ## the tests that need no whole run and no clock, on WORKERS=2 processes
 	$(PYTEST) -n $(WORKERS) -m "not run and not long and not realtime" --ignore=tests/vcan --junitxml=$(REPORTS)/$@.xml
 
 runs: $(READY) ## whole runs in virtual time, the examples, and laws that take long, on WORKERS=2 processes
