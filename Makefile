@@ -98,7 +98,6 @@ paper: $(READY) ## the campaigns of docs/paper.md, and its tables from them (how
 	run campaigns/compensated.yaml --out $$to/compensated.sqlite; \
 	run campaigns/compensated.yaml --out $$to/compensated-pins.sqlite --set rig.stops=on; \
 	run campaigns/critical_duration.yaml --out $$to/critical_duration.sqlite; \
-	run campaigns/critical_duration.yaml --out $$to/critical_duration-3deg.sqlite --set 'tolerance=3 deg'; \
 	run campaigns/small_faults.yaml --out $$to/small_faults.sqlite; \
 	run campaigns/small_faults.yaml --out $$to/small_faults-pins.sqlite --set rig.stops=on; \
 	run campaigns/bit_flips.yaml --out $$to/bit_flips.sqlite
