@@ -462,3 +462,10 @@ def test_the_plug_in_is_no_burden_to_a_process_without_pytest() -> None:
     """`exo-hil` itself never loads it."""
     code = "import sys, testbench.cli; assert 'pytest' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.parametrize("asked", [False, True])
+def test_fifo_is_asked_for_where_the_command_line_says_so(pytester: pytest.Pytester, asked: bool) -> None:
+    """`--exo-fifo` reaches the processes of the rig; the rig itself is not started here."""
+    pytester.makepyfile(f"def test_it(exo):\n    assert exo._setup.fifo is {asked}\n")
+    run(pytester, "--exo-bus", "hub", *(["--exo-fifo"] if asked else [])).assert_outcomes(passed=1)
