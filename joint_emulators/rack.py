@@ -8,7 +8,7 @@ SYNC latches the last finished step.
 from typing import Final, final
 
 from canopen_exo.bus.frame import Frame
-from canopen_exo.bus.node import IGNORE, NEVER, TAKE, Node, Out, PortState, open_filter
+from canopen_exo.bus.node import IGNORE, NEVER, NO_FILTER, TAKE, Node, Out, PortState, open_filter
 from canopen_exo.device import Device
 from canopen_exo.plan import SYNC
 from joint_emulators.drive import Drive
@@ -44,9 +44,11 @@ class Rack(Node):
         self._torques: Final[list[float]] = [0.0] * len(drives)
         self._sensors: Final[list[JointSensor]] = [drive.sensor for drive in drives]
         self.wake_at = 0
-        self._hearing: list[list[Device]] = []
+        self._hearing: Final[list[list[Device]]] = [[] for _ in range(NO_FILTER)]
+        self._heard: Final[set[int]] = set()
         self._revision: int = -1
         self._filter: Final[bytearray] = open_filter()
+        self._filter[:NO_FILTER] = bytes([IGNORE]) * NO_FILTER
         self.filters = [self._filter] * len(devices)
         self._route()
         sample(self._sensors, plant.q, plant.tau)
@@ -125,9 +127,14 @@ class Rack(Node):
         if revision == self._revision:
             return
         self._revision = revision
-        self._hearing = [[] for _ in range(2048)]
+        for can_id in self._heard:
+            self._hearing[can_id] = []
+            self._filter[can_id] = IGNORE
+        self._heard.clear()
         for device in self.devices:
-            for can_id in set(device.cob_ids()):
-                self._hearing[can_id].append(device)
-        for can_id, hearing in enumerate(self._hearing):
-            self._filter[can_id] = TAKE if hearing else IGNORE
+            for can_id in device.cob_ids():
+                hearing = self._hearing[can_id]
+                if device not in hearing:
+                    hearing.append(device)
+                self._filter[can_id] = TAKE
+                self._heard.add(can_id)

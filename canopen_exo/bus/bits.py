@@ -135,7 +135,7 @@ def base_frame_bits(can_id: int, data: bytes) -> int:
     second: int
     third: int
     fourth: int
-    if size == 8:  # nearly all frames have 8 or 4 bytes: written out, without a loop
+    if size == 8:  # most frames that are not measured already: written out, without a loop
         row, crc, bits = _HEADS[8][can_id]
         first, second, third, fourth = _WORDS[8](data)
         following, counts, crcs = _NEXT, _COUNT, _CRC
@@ -145,12 +145,14 @@ def base_frame_bits(can_id: int, data: bytes) -> int:
         four = following[three][fourth]
         crc = crcs[crcs[crcs[crcs[crc ^ first] ^ second] ^ third] ^ fourth]
         return bits + counts[one] + counts[two] + counts[three] + counts[four] + _LAST_COUNT[following[four][crc]]
-    if size == 4:
-        row, crc, bits = _HEADS[4][can_id]
-        first, second = _WORDS[4](data)
-        one = row[first]
-        two = _NEXT[one][second]
-        return bits + _COUNT[one] + _COUNT[two] + _LAST_COUNT[_NEXT[two][_CRC[_CRC[crc ^ first] ^ second]]]
+    if size % 2 == 0:
+        row, crc, bits = _HEADS[size][can_id]
+        for first in _WORDS[size](data):
+            one = row[first]
+            row = _NEXT[one]
+            bits += _COUNT[one]
+            crc = _CRC[crc ^ first]
+        return bits + _LAST_COUNT[row[crc]]
     return frame_bits(can_id, data, False, False, size)
 
 

@@ -198,7 +198,7 @@ class Loop:
                 now = end if end < wake else wake
                 if now > until:
                     break
-                is_shared = True
+                is_shared = end == now
             if is_shared:  # the other frames of this instant
                 for medium in media:
                     if medium.end == now:
