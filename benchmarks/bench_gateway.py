@@ -315,9 +315,9 @@ ROWS: Final[list[tuple[str, Callable[[Figures], float], float]]] = [
 
 
 def ratios(ours: list[Figures], theirs: list[Figures], figure: Callable[[Figures], float]) -> list[float]:
-    """Round by round, where neither lost a frame; sorted."""
+    """Round by round, where neither lost a frame, nor was too cheap for the clock of the CPU; sorted."""
     pairs = [(figure(one), figure(other)) for one, other in zip(ours, theirs, strict=True)]
-    return sorted([one / other for one, other in pairs if max(one, other) < math.inf] or [math.inf])
+    return sorted([one / other for one, other in pairs if max(one, other) < math.inf and other > 0.0] or [math.inf])
 
 
 def judged(ratio: float, budget: float, is_busy: bool) -> str:
