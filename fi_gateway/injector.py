@@ -179,6 +179,11 @@ class Injector:
         """Where the last target frame came in; before one has, a side from which the target travels."""
         return self._port
 
+    @property
+    def adds(self) -> bool:
+        """Whether it sends frames of its own, or under another COB-ID: see Fault."""
+        return self._fault.adds
+
     def takes(self, cob_id: int) -> bool:
         """Whether frames with that COB-ID are its target, or fire it."""
         trigger = self.trigger

@@ -14,8 +14,6 @@ from numpy.random import Generator
 from canopen_exo.bus.frame import Frame
 from canopen_exo.bus.loop import Loop
 from canopen_exo.bus.medium import Medium
-from canopen_exo.bus.node import NEVER
-from canopen_exo.bus.recovery import is_present
 from canopen_exo.bus.wire import Wire
 from fi_gateway.faults.base import Fault
 from fi_gateway.outlet import Outlet
@@ -24,7 +22,7 @@ from fi_gateway.wire_faults import BabblingIdiot, WireFault, WireWatch
 
 @mypyc_attr(allow_interpreted_subclasses=True)
 class OnWire(Fault):
-    """A fault on a bus. bus: "controller" or "drive"; adds: what it does is frames of its own.
+    """A fault on a bus. bus: "controller" or "drive".
 
     has_turned: its window has opened or closed, and the bus does not know.
     """
@@ -32,7 +30,6 @@ class OnWire(Fault):
     def __init__(self, bus: str) -> None:
         super().__init__()
         self.bus: str = bus
-        self.adds: bool = False
         self.has_turned: bool = False
 
     @property
@@ -105,8 +102,10 @@ class Disturbed(OnWire):
 
 @final
 class SwitchedOff(OnWire):
-    """A controller goes bus-off when the window opens, whatever its counters (TEC = 256), and is asked to restart
-    `restart_ns` after the end of the window. port: its number on that bus. A frame that is on the wire ends first.
+    """A controller goes bus-off when the window opens, whatever its counters (TEC = 256), or is kept there.
+
+    It is asked to restart `restart_ns` after the end of the window, of several that overlap after that of the last.
+    port: its number on that bus. A frame that is on the wire ends first.
 
     EN 50159: deletion (of everything from and to that node, and of what waits in its queue). FIBlock: none.
     """
@@ -117,8 +116,7 @@ class SwitchedOff(OnWire):
         self.restart_ns: Final[int] = restart_ns
         self._watch: WireWatch = WireWatch()
         self._is_open: bool = False
-        self._is_off: bool = False
-        self._own_restart_ns: int = NEVER
+        self._is_holding: bool = False
 
     def listen(self, watch: WireWatch) -> None:
         """See OnWire."""
@@ -137,18 +135,16 @@ class SwitchedOff(OnWire):
     def turn(self, now: int, wire: Wire) -> None:
         """See OnWire."""
         port = wire.medium.ports[self.port]
-        if self._is_open and is_present(port):
-            self._is_off = True
-            self._own_restart_ns, port.restart_ns = port.restart_ns, NEVER
-            wire.switch_off(now, port)
+        if self._is_open and not self._is_holding:
+            self._is_holding = True
+            wire.hold_off(now, port)
             self._watch.disturbed(now, None)
-        elif self._is_off and not self._is_open:
-            self._is_off = False
-            port.restart_ns = self._own_restart_ns
-            wire.restart(now, port, self.restart_ns)
+        elif self._is_holding and not self._is_open:
+            self._is_holding = False
+            wire.let_go(now, port, self.restart_ns)
 
     def __reduce__(self) -> tuple[type["SwitchedOff"], tuple[str, int, int], dict[str, object]]:
-        names = ("has_turned", "_is_open", "_is_off", "_own_restart_ns")
+        names = ("has_turned", "_is_open", "_is_holding")
         return SwitchedOff, (self.bus, self.port, self.restart_ns), {name: getattr(self, name) for name in names}
 
 

@@ -22,6 +22,9 @@ from canopen_exo.bus.loop import MediumOut
 from canopen_exo.bus.node import NEVER, Node, Out
 from fi_gateway.errors import FaultError
 
+_LOOK_AHEAD_NS: Final = 1_000_000
+"""How far noise is drawn ahead of an idle bus: the next flip may lie beyond the end of the run."""
+
 _ACK_SLOT_TO_END: Final = 12
 """ACK slot and delimiter, end of frame and intermission (ISO 11898-1)."""
 
@@ -37,7 +40,8 @@ class WireWatch:
 class WireFault(Disturbance):
     """A disturbance with a window [since, until), ns.
 
-    seen: attempts to send a frame that it could disturb, in this window or the last one; watch: who is told.
+    seen: attempts to send a frame that it could disturb, in this window or the last one, and times at which it
+    disturbed an idle bus; watch: who is told.
     """
 
     def __init__(self) -> None:
@@ -56,7 +60,9 @@ class WireFault(Disturbance):
         """The stream for what it draws; for those that draw nothing, nothing."""
 
     def disturbed(self, now: int, frame: Frame | None) -> None:
-        """Tell it on."""
+        """Tell it on. Idle bits count as an attempt where an error on them was noticed."""
+        if frame is None:
+            self.seen += 1
         self.watch.disturbed(now, frame)
 
     def end(self, now: int) -> None:
@@ -248,6 +254,8 @@ class Noise(WireFault):
                 at += 1
             if self._known_ns >= self.until:
                 return NEVER
+            if self._known_ns > after + _LOOK_AHEAD_NS:
+                return self._known_ns  # nothing up to there; look again then
             self._draw()
 
     def _draw(self) -> None:

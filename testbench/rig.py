@@ -83,9 +83,12 @@ def build_rig(params: RigParams, injectors: list[Injector]) -> Rig:
 
 
 def _install_wire(loop: Loop, medium: Medium, injectors: list[Injector]) -> None:
-    """Let errors happen on a bus for which there are wire faults; any other one stays ideal."""
+    """Let errors happen on a bus for which there are wire faults, or on which two nodes may send the same COB-ID.
+
+    Any other one stays ideal.
+    """
     faults = [one.wire for one in injectors if one.wire is not None and one.wire.bus == medium.name]
-    if not faults:
+    if not faults and not any(one.adds for one in injectors):
         return
     for fault in faults:
         fault.connect(loop, medium)

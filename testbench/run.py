@@ -246,18 +246,21 @@ def traffic(rows: list[Transmission], media: Sequence[Medium], start: int, end: 
 def _invalid_reasons(rig: Rig) -> list[str]:
     """Why the run proves nothing: frames lost without a fault, two senders with one id.
 
-    A cut bus explains both, and so does a wire fault that did something: what waits for one bus then floods the other.
+    A cut bus explains losses, and so does a fault on a wire, of frames in addition, or of frames held back, that did
+    something: what waits for one bus then floods the other. The first two also explain two senders.
     """
     media = (rig.controller_bus, rig.drive_bus)
-    on_wire = any(one.wire is not None and one.manifested for one in rig.gateway.injectors)
-    cut = on_wire or any(medium.cuts for medium in media)
+    collides = any((one.wire is not None or one.adds) and one.manifested for one in rig.gateway.injectors)
+    floods = collides or any(one.frames_delayed or one.frames_inserted for one in rig.gateway.records)
+    floods = floods or any(medium.cuts for medium in media)
     reasons = []
     for medium in media:
         dropped = sum(port.dropped for port in medium.ports)
-        if dropped and not cut:
+        if dropped and not floods:
             reasons.append(f"{medium.name} bus: {dropped} frames lost in full transmit queues")
-        if medium.collisions and not on_wire:
+        if medium.collisions and not collides:
             reasons.append(f"{medium.name} bus: two senders with the same CAN id at once, {medium.collisions} times")
+    cut = any(medium.cuts for medium in media)
     if not rig.gateway.injectors and not cut and not rig.controller.completed:
         reasons.append("the motion was given up without a fault")
     return reasons

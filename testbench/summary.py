@@ -191,6 +191,7 @@ def summary_text(document: Summary) -> str:
         *_real_time_lines(document),
         *_replay_lines(document),
         *_few([f"      {reason}" for reason in document["invalid_reasons"]], 2, "reasons"),
+        *_overflow_lines(document),
         *_few([_event_line(event) for event in document["events"]], 3, "events"),
     ]
     tail = [
@@ -204,6 +205,17 @@ def summary_text(document: Summary) -> str:
     injections = _injection_lines(document)
     room = max(MOST_LINES - len(head) - len(tail) - 1, 1)
     return "\n".join([*head, injections[0], *_few(injections[1:], room, "injections"), *tail]) + "\n"
+
+
+def _overflow_lines(document: Summary) -> list[str]:
+    """Frames that full queues have dropped because of a fault; without one they are a reason why a run is invalid."""
+    if not document["valid"]:
+        return []
+    return [
+        f"      {name} bus: {bus['queue_overflows']} frames lost in full transmit queues, as faults had it"
+        for name, bus in document["bus"].items()
+        if bus["queue_overflows"]
+    ]
 
 
 def _unmet_text(document: Summary) -> str:

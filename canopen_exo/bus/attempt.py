@@ -21,8 +21,8 @@ END: Final = 3
 class Step:
     """Something that happens within an attempt, after bit `at`.
 
-    COUNT: the counters of `port` are tec and rec. ERROR: `port` was the first to notice `error`. FRAME: `frame`, sent
-    by `port`, was accepted by `ports`. END: the next attempt may begin.
+    COUNT: the counters of `port` are tec and rec. ERROR: `port` was the first to notice `error`, or to send an overload
+    frame. FRAME: `frame`, sent by `port`, was accepted by `ports`. END: the next attempt may begin.
     """
 
     __slots__ = ("at", "error", "frame", "kind", "port", "ports", "rec", "tec")
@@ -96,22 +96,24 @@ def steps_of(controllers: list[Controller], bits: int, ports: list[Port]) -> lis
         for counted in controller.counted:
             for number in controller.ports:
                 steps.append(Step(counted.at, COUNT, ports[number], counted.tec, counted.rec))
-    _note_error(controllers, ports, steps)
+    _note_first(controllers, ports, steps, False)
+    _note_first(controllers, ports, steps, True)
     _note_frames(controllers, ports, steps)
     steps.append(Step(bits - 1, END, ports[controllers[0].ports[0]]))
     steps.sort(key=_order)
     return steps
 
 
-def _note_error(controllers: list[Controller], ports: list[Port], steps: list[Step]) -> None:
-    """The first error of the attempt that somebody noticed; of several at once the sender's."""
+def _note_first(controllers: list[Controller], ports: list[Port], steps: list[Step], of_overloads: bool) -> None:
+    """The first error of the attempt that somebody noticed, or the first overload; of several at once the sender's."""
     found: Detected | None = None
     number = 0
     for controller in controllers:
-        if controller.found:
-            error = controller.found[0]
-            if found is None or (error.at, not error.transmitting) < (found.at, not found.transmitting):
-                found, number = error, controller.ports[0]
+        notices = controller.overloads if of_overloads else controller.found
+        if notices:
+            first = notices[0]
+            if found is None or (first.at, not first.transmitting) < (found.at, not found.transmitting):
+                found, number = first, controller.ports[0]
     if found is not None:
         steps.append(Step(found.at, ERROR, ports[number], error=found))
 

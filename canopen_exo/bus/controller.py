@@ -45,6 +45,8 @@ STUFF_ERROR: Final = 2
 FORM_ERROR: Final = 3
 CRC_ERROR: Final = 4
 ACK_ERROR: Final = 5
+OVERLOAD: Final = 6
+"""No error: it began an overload frame. Only in `Controller.overloads`."""
 
 FLAG_LENGTH: Final = 6
 DELIMITER_LENGTH: Final = 8
@@ -111,15 +113,15 @@ class Controller:
     frame: what it sends or wants to send; transmitter: it is the sender of the frame under way, also while error frames
     follow; sent_at, accepted_at: bits at which it knew its frame sent, and another one received (-1: not);
     accepted: that frame; idle_at: last bit of its intermission; suspends: it must wait 8 bits more then.
-    found, counted: what happened in this attempt.
+    found, overloads, counted: what happened in this attempt.
     """
 
     __slots__ = (
         "_acks", "_arbitration_bits", "_count", "_crc", "_cursor", "_extended", "_has_failed",
         "_is_overload", "_last", "_overloads",
         "_passive", "_pending_ack", "_position", "_run", "_sending", "_stream", "_total", "_value", "accepted",
-        "accepted_at", "counted", "found", "frame", "idle_at", "out", "ports", "rec", "sent_at", "state", "suspends",
-        "tec", "transmitter",
+        "accepted_at", "counted", "found", "frame", "idle_at", "out", "overloads", "ports", "rec", "sent_at", "state",
+        "suspends", "tec", "transmitter",
     )  # fmt: skip
 
     def __init__(self, ports: list[int], tec: int, rec: int) -> None:
@@ -136,6 +138,7 @@ class Controller:
         self.idle_at: int = -1
         self.suspends: bool = False
         self.found: list[Detected] = []
+        self.overloads: list[Detected] = []
         self.counted: list[Counted] = []
         self._acks: bool = True
         self._sending: bool = False
@@ -348,11 +351,11 @@ class Controller:
             self._apply(at, RX_ERROR)
         elif not self._pending_ack and not spared:
             self._apply(at, TX_ERROR)
-        self._note(at, kind, place, index)
+        self._note(self.found, at, kind, place, index)
         self._start_flag(passive, False)
 
-    def _note(self, at: int, kind: int, place: int, index: int) -> None:
-        self.found.append(
+    def _note(self, notices: list[Detected], at: int, kind: int, place: int, index: int) -> None:
+        notices.append(
             Detected(at, kind, self.transmitter, place, index, self._extended, self._total, self.tec, self.rec)
         )
 
@@ -361,6 +364,7 @@ class Controller:
             self._error(at, FORM_ERROR)
             return
         self._overloads += 1
+        self._note(self.overloads, at, OVERLOAD, self.state, self._position)
         self._start_flag(False, True)
 
     def _start_flag(self, passive: bool, is_overload: bool) -> None:
@@ -384,7 +388,7 @@ class Controller:
         elif seen:
             passive = is_passive(self.tec, self.rec)
             self._apply(at, TX_FLAG_BIT if self.transmitter else RX_FLAG_BIT)
-            self._note(at, BIT_DOMINANT, FLAG, self._position)
+            self._note(self.found, at, BIT_DOMINANT, FLAG, self._position)
             self._start_flag(passive, False)
             return
         else:

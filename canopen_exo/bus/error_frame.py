@@ -16,6 +16,7 @@ from canopen_exo.bus.controller import (
     FORM_ERROR,
     FRAME,
     INTERMISSION,
+    OVERLOAD,
     STUFF_ERROR,
     TAIL,
     Detected,
@@ -50,7 +51,7 @@ _CLASSES: Final = (
     (_RESTARTED, "controller restarted"),
 )
 
-_DETAIL: Final = {BIT_DOMINANT: 0x08, BIT_RECESSIVE: 0x10, FORM_ERROR: 0x02, STUFF_ERROR: 0x04}
+_DETAIL: Final = {BIT_DOMINANT: 0x08, BIT_RECESSIVE: 0x10, FORM_ERROR: 0x02, STUFF_ERROR: 0x04, OVERLOAD: 0x20}
 """data[2] by kind of error; a CRC error has no bit of its own, its location says it."""
 
 _DATA: Final = 0x0A
@@ -142,7 +143,7 @@ def write_error_frame(state: PortState, restarted: bool = False) -> tuple[int, b
 
 def write_bus_error(error: Detected) -> tuple[int, bytes]:
     """The same for one error that a controller noticed, with its counters afterwards."""
-    can_id = ERROR_FLAG | _BUS_ERROR | _COUNTERS
+    can_id = ERROR_FLAG | (0 if error.kind == OVERLOAD else _BUS_ERROR) | _COUNTERS
     if error.kind == ACK_ERROR:
         can_id |= _NO_ACK
     else:

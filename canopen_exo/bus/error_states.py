@@ -38,23 +38,24 @@ class ErrorStates:
                 self._go_off(now, port)
 
     def switch_off(self, now: int, port: Port, events: list[WireEvent]) -> None:
-        """Make a port that takes part bus-off, whatever its counters; it restarts as from any bus-off."""
+        """Make a port that takes part bus-off, whatever its counters."""
         port.tec = BUS_OFF_LIMIT
         self._change(port, ErrorState.BUS_OFF, "switched off", events)
         self._go_off(now, port)
 
     def request(self, port: Port, at_ns: int) -> None:
-        """Ask a port to restart at `at_ns`, unless it was asked before."""
-        for recovery in self.recoveries:
-            if recovery.port is port:
-                return
+        """Ask a port that is bus-off to restart at `at_ns`."""
         self.recoveries.append(Recovery(port, at_ns))
+
+    def forbid(self, port: Port) -> None:
+        """It is not to restart until it is asked anew."""
+        self.recoveries = [one for one in self.recoveries if one.port is not port]
 
     def unplug(self, port: Port) -> None:
         """Its node is gone: what waits is lost, and it is not asked to restart any more."""
         if is_present(port):
             self._close(port)
-        self.recoveries = [one for one in self.recoveries if one.port is not port]
+        self.forbid(port)
         port.state = ErrorState.DOWN
 
     def plug(self, now: int, port: Port) -> None:

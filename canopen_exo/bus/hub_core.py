@@ -123,7 +123,7 @@ class SharedBus:
         self.rejected: int = 0
         self.most: int = 0
 
-    def join(self, client: Client) -> None:
+    def join(self, client: Client, now: int) -> None:
         """Connect a client."""
         self.clients.append(client)
         client.bus = self
@@ -214,9 +214,9 @@ class TimedBus(SharedBus):
         self.lateness: Final[Lateness] = Lateness()
         self.seats: Final[list[Client | None]] = []
 
-    def join(self, client: Client) -> None:
+    def join(self, client: Client, now: int) -> None:
         """Connect a client to a port that nobody uses any more, or to a new one."""
-        super().join(client)
+        super().join(client, now)
         medium = self.medium
         for port, seat in enumerate(self.seats):
             there = medium.ports[port]
@@ -399,7 +399,7 @@ class Hub:
                 raise HubRecordError(f"bus {name!r} would be one more than the {MAX_BUSES} this hub keeps; restart it")
             bus = self._make(name, now)
             self.buses[name] = bus
-        bus.join(client)
+        bus.join(client, now)
         client.outbox.extend(Welcome(self.bitrate, now, now + self.realtime_offset_ns).pack())
         return bus
 

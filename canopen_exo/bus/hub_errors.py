@@ -32,10 +32,10 @@ class ErrorBus(TimedBus):
         self._taken: Final[dict[int, int]] = {}  # by port: frames of this client that its queue took
         self._confirmed: Final[dict[int, int]] = {}
 
-    def join(self, client: Client) -> None:
+    def join(self, client: Client, now: int) -> None:
         """Connect a client: one more that acknowledges."""
-        super().join(client)
-        self.wire.connect(self._now, self.medium.ports[client.port])
+        super().join(client, now)
+        self.wire.connect(now, self.medium.ports[client.port])
         self._taken[client.port] = self._confirmed[client.port] = 0
 
     def leave(self, client: Client) -> None:

@@ -11,7 +11,8 @@ few bits in which an undisturbed node could already start waits with the others.
 A frame is received at the end of its intermission, as everywhere in this project, also where a receiver accepts it and
 an error frame follows.
 Where an undisturbed frame is worked out again within its arbitration, those that lose it later count as receivers.
-Of the error frames of one attempt the trace shows the first error that somebody noticed.
+Of the error frames of one attempt the trace shows the first error that somebody noticed, and of the overload frames the
+first. Lost arbitration is no error and not told.
 """
 
 from typing import Final, final
@@ -19,14 +20,14 @@ from typing import Final, final
 from canopen_exo.bus.attempt import COUNT, END, ERROR, Step, controllers_of, put_back, steps_of
 from canopen_exo.bus.bit_engine import run, split
 from canopen_exo.bus.confinement import RX_SUCCESS, TX_SUCCESS, count, is_passive
-from canopen_exo.bus.controller import IDLE, OFF, SUSPEND_LENGTH, Controller
+from canopen_exo.bus.controller import IDLE, OFF, OVERLOAD, SUSPEND_LENGTH, Controller
 from canopen_exo.bus.disturbance import NO_ACK, Disruption, Disturbance, joined
 from canopen_exo.bus.error_frame import write_bus_error
 from canopen_exo.bus.error_states import ErrorStates
 from canopen_exo.bus.frame import FLAG_ERROR, Frame
 from canopen_exo.bus.medium import Medium, Port, WireEvent, Wiring
 from canopen_exo.bus.node import NEVER, ErrorState, Out
-from canopen_exo.bus.recovery import is_present
+from canopen_exo.bus.recovery import RECESSIVE_BITS, is_present
 
 MARGIN: Final = 64
 """Bits after the length of a frame that disturbances are asked about: for two error frames of the longest kind."""
@@ -40,7 +41,8 @@ _LONGEST_REST: Final = 32
 _STATE: Final = (
     "disturbances", "sink", "wake_at", "attempts", "spans",
     "_started_ns", "_disruptions", "_initial", "_engaged", "_steps", "_done", "_unsettled", "_free_ns",
-    "_states", "_suspects", "_sent", "_is_noticed", "_is_charged", "_is_calm", "_is_stale",
+    "_states", "_suspects", "_sent", "_is_noticed", "_is_charged", "_is_calm", "_is_stale", "_is_held",
+    "_holds", "_joined_ns",
 )  # fmt: skip
 """What `__reduce__` copies besides the medium, which need not be whole yet."""
 
@@ -74,6 +76,9 @@ class Wire(Wiring):
         self._is_charged: bool = False
         self._is_calm: bool = True
         self._is_stale: bool = False
+        self._is_held: bool = False
+        self._holds: dict[int, int] = {}
+        self._joined_ns: dict[int, int] = {}
         for disturbance in disturbances:
             self.wake_at = min(self.wake_at, disturbance.next_ns(1))
 
@@ -109,6 +114,7 @@ class Wire(Wiring):
         medium.waiting.pop(at)
         medium.on_wire = first
         medium.end = now + bits * bit_ns
+        self._is_held = False
         medium.is_watched = self._is_charged or not self._is_calm
         self._started_ns = now
 
@@ -241,7 +247,7 @@ class Wire(Wiring):
             if step.kind == COUNT:
                 self._states.count(now, step.port, step.tec, step.rec, events)
             elif step.kind == ERROR and step.error is not None:
-                medium.errors += 1
+                medium.errors += 0 if step.error.kind == OVERLOAD else 1
                 self._blame(now)
                 can_id, data = write_bus_error(step.error)
                 events.append(WireEvent(Frame(can_id, data, FLAG_ERROR), step.port, []))
@@ -255,7 +261,8 @@ class Wire(Wiring):
             medium.end = self._time(self._steps[0])
         else:
             medium.is_watched = False
-            self._free_ns = now
+            # the last 11 bits of an attempt were recessive, unless it was broken off at LIMIT: they are yet to come
+            self._free_ns = now + RECESSIVE_BITS * medium.bit_ns if self._is_held else now
             self._states.finish(now, self._free_ns, events)
             self._plan_wake(now)
         self.sink.happened(now, events)
@@ -310,7 +317,8 @@ class Wire(Wiring):
                 rest += SUSPEND_LENGTH
             for number in controller.ports:
                 medium.ports[number].ready_ns = now + rest * medium.bit_ns
-        if len(unsettled) == len(self._engaged):  # LIMIT: nobody has come to rest
+        self._is_held = len(unsettled) == len(self._engaged)
+        if self._is_held:  # LIMIT: nobody has come to rest
             medium.is_restless = True
         self._unsettled = unsettled
         self._engaged = []
@@ -341,10 +349,9 @@ class Wire(Wiring):
         """What is on the wire, if anything, is not worked out by the bit engine."""
         return not self._steps
 
-    @staticmethod
-    def hears(port: Port) -> bool:
-        """It takes part in the bus."""
-        return is_present(port)
+    def hears(self, port: Port) -> bool:
+        """It took part in the bus from the beginning of what is, or was last, on the wire."""
+        return is_present(port) and self._joined_ns.get(port.number, 0) <= self._started_ns
 
     def reconsider(self) -> None:
         """Counters or states of ports were set from outside."""
@@ -361,9 +368,17 @@ class Wire(Wiring):
             self._plan_wake(now + 1)
             self.sink.happened(now, events)
 
-    def restart(self, now: int, port: Port, delay_ns: int = 0) -> None:
-        """Ask a port that is bus-off, and was not asked yet, to restart in `delay_ns`, whatever its `restart_ns`."""
-        if port.state is ErrorState.BUS_OFF:
+    def hold_off(self, now: int, port: Port) -> None:
+        """Make a port bus-off and keep it so, whatever its counters, until `let_go` was called as often as this."""
+        self._holds[port.number] = self._holds.get(port.number, 0) + 1
+        self.switch_off(now, port)
+        self._states.forbid(port)
+        self._plan_wake(now + 1)
+
+    def let_go(self, now: int, port: Port, delay_ns: int = 0) -> None:
+        """Ask a port that nobody holds off any more to restart in `delay_ns`, whatever its `restart_ns`."""
+        self._holds[port.number] -= 1
+        if self._holds[port.number] == 0 and port.state is ErrorState.BUS_OFF:
             self._states.request(port, now + delay_ns)
             self._is_calm = False
             self._plan_wake(now + 1)
@@ -383,9 +398,14 @@ class Wire(Wiring):
         self._plan_wake(now + 1)
 
     def connect(self, now: int, port: Port) -> None:
-        """A node is plugged in where one was unplugged."""
+        """A node is plugged in. It takes part once it has seen 11 recessive bits: the end of a frame has them."""
         if port.state is ErrorState.DOWN:
             self._states.plug(now, port)
+        medium = self.medium
+        is_idle = medium.end == NEVER
+        port.ready_ns = self._joined_ns[port.number] = now + RECESSIVE_BITS * medium.bit_ns if is_idle else medium.end
+        self._is_calm = False
+        self._plan_wake(now + 1)
 
     # --- timers ----------------------------------------------------------------------------------------------------
 

@@ -18,7 +18,9 @@ class Fault:
     """What happens to the frames of an active injector.
 
     signal: what it acts on, None for the whole payload or frame; saturated: frames of the current or last activation
-    whose value was cut at the signal's range; spares: whether `apply` giving the frame itself means it was left alone.
+    whose value was cut at the signal's range; spares: whether `apply` giving the frame itself means it was left alone;
+    adds: it sends frames that would not be there without it, or under another COB-ID, so that two nodes may send the
+    same id: set by the subclass.
     wake_at: absolute ns while active: when it wants `wake`, to insert frames without being asked; NEVER for not at all.
     Values here are made for one injector and not shared. A subclass that keeps state defines `__reduce__`.
     """
@@ -27,6 +29,7 @@ class Fault:
         self.signal: Signal | None = signal
         self.saturated: int = 0
         self.spares: bool = False
+        self.adds: bool = False
         self.wake_at: int = NEVER
 
     def begin(self, now: int, held: dict[int, Frame], rng: Generator) -> bool:

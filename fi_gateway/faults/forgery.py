@@ -27,6 +27,7 @@ class Insert(Fault):
         if not 0 <= every_ns < NEVER:
             raise FaultError(f"insert: period {every_ns} ns given, allowed 0..{NEVER - 1} ns")
         self.spares = every_ns > 0
+        self.adds = True
         self._frame: Final[Frame] = frame
         self._every_ns: Final[int] = every_ns
 
@@ -68,6 +69,7 @@ class Masquerade(Fault):
         super().__init__(None)
         if not 0 <= cob_id <= 0x7FF:
             raise FaultError(f"masquerade: COB-ID {cob_id:#x} given, allowed 0x0..0x7ff")
+        self.adds = True
         self._cob_id: Final[int] = cob_id
         self._is_copying: Final[bool] = is_copying
 

@@ -125,6 +125,7 @@ class Duplicate(Fault):
         super().__init__(None)
         if copies < 1:
             raise FaultError(f"duplicate: {copies} copies asked for, allowed 1 and more")
+        self.adds = True
         self._copies: Final[int] = copies
         self._gap_ns: Final[int] = _span("duplicate: gap", gap_ns)
 
@@ -156,6 +157,7 @@ class Replay(Fault):
             raise FaultError(f"replay: {frames} frames given, allowed 1 and more")
         self.spares = True
         self._frames: Final[int] = frames
+        self.adds = is_adding
         self._is_adding: Final[bool] = is_adding
         self._recorded: dict[int, list[Frame]] = {}
         self._sent: dict[int, int] = {}

@@ -209,6 +209,23 @@ def test_bus_off_takes_one_port_off() -> None:
     assert receiver.heard > 15
 
 
+@pytest.mark.parametrize("restart_ns", [0, 50 * MS])
+def test_port_does_not_leave_bus_off_while_the_bus_is_dominant(restart_ns: int) -> None:
+    """There is no recessive bit, so none of the 128 sequences of 11, until the bus is free."""
+    fault = StuckDominant()
+    loop, medium, wire = bus_of([Ticker(MS), Ticker()], [fault])
+    port = medium.ports[0]
+    port.restart_ns = restart_ns
+    fault.begin(5 * MS + 500 * BIT, 1000 * MS)
+    loop.run_until(6 * MS)
+    wire.switch_off(loop.now, port)
+    states = []
+    for until in (1000 * MS + 128 * 11 * BIT - 1, 1000 * MS + 129 * 11 * BIT):
+        loop.run_until(until)
+        states.append(port.state)
+    assert states == [ErrorState.BUS_OFF, ErrorState.ERROR_ACTIVE]
+
+
 def test_babbling_idiot_with_id_0_starves_the_others() -> None:
     """It wins every arbitration; when it stops they go on."""
     receiver, idiot = Ticker(), BabblingIdiot(Frame(0, b""), BIT)
@@ -289,6 +306,19 @@ def test_bursts_have_the_share_and_the_length_of_the_chain() -> None:
     bursts = 1 + sum(later - earlier > 1 for earlier, later in pairwise(flips))
     assert abs(bursts - 455) < 107
     assert abs(len(flips) - 9091) < 3000
+
+
+@pytest.mark.parametrize("rate_bad", [1e-9, 1e-3])
+def test_next_time_of_rare_noise_is_looked_for_in_steps(rate_bad: float) -> None:
+    """The next flip may be years away: no call draws much further than asked for, and none passes over a flip."""
+    noise = GilbertElliott(1e-3, 0.5, 0.0, rate_bad, BIT, rng())
+    noise.begin(0)
+    at, until = 0, 2000 * MS
+    while at < until:
+        upcoming = noise.next_ns(at)
+        assert at <= upcoming < at + 30 * MS  # 1 ms, and the good state that it ends in: 1 ms on average
+        assert all(flip.first * BIT + at >= upcoming for flip in noise.errors(at, upcoming, BIT, None, -1))
+        at = upcoming + 1
 
 
 def test_next_time_is_that_of_the_next_flip() -> None:

@@ -183,6 +183,68 @@ def test_a_short_circuit_stops_its_bus_for_its_window() -> None:
     assert max(row.end_ns for row in result.faulted.rows if row.bus == DRIVE_BUS) > one.end_ns + 400_000_000
 
 
+def test_an_overload_frame_is_a_disturbed_attempt() -> None:
+    """`once` ends with it; nobody repeats anything, and it is told."""
+    fault = "{type: bit_error, field: eof, bit: 6, receivers: [left_knee]}"
+    result = run_scenario(scenario_of(injector("overload", "{pdo: TPDO1, node: right_knee}", fault)))
+    entry = found(result, "overload")
+    assert (entry["attempts_seen"], entry["attempts_disturbed"]) == (1, 1)
+    assert [row.frame.can_id for row in error_rows(result.faulted)] == [0x20000208]
+    assert len(result.faulted.rows) == len(result.golden.rows) + 1
+
+
+def test_a_bus_off_that_overlaps_another_one_lasts_until_both_are_over() -> None:
+    """The drive is back after the end of the longer window, not of the shorter one."""
+    first = injector("short", "{wire: drive, node: right_knee}", "{type: bus_off}", "{type: at, time: 0.2 s}",
+                     "effect: {type: constant_time, duration: 10 ms}")  # fmt: skip
+    second = injector("long", "{wire: drive, node: right_knee}", "{type: bus_off}", "{type: at, time: 0.205 s}",
+                      "effect: {type: constant_time, duration: 80 ms}")  # fmt: skip
+    result = run_scenario(scenario_of(first, second))
+    (told,) = [one for one in result.document["events"] if "8140" in one["text"]]
+    assert told["time_s"] > 0.285 + 0.001408
+    assert [found(result, name)["attempts_disturbed"] for name in ("short", "long")] == [1, 1]
+
+
+def test_idle_bits_that_are_disturbed_count_as_an_attempt() -> None:
+    """Never more attempts disturbed than seen."""
+    more = "effect: {type: constant_time, duration: 3 ms}"
+    result = run_scenario(scenario_of(injector("short", "{}", "{type: stuck_dominant}", more=more)))
+    entry = found(result, "short")
+    assert 0 < entry["attempts_disturbed"] <= entry["attempts_seen"]
+
+
+def test_two_nodes_that_send_one_id_collide_also_without_a_wire_fault() -> None:
+    """A forged frame while the drive sends its own with that id: bit errors, and the run is valid."""
+    fault = "{type: insert, cob_id: 0x185, payload: '01 02 03 04 05 06 07 08', every: 100 us}"
+    more = "effect: {type: constant_time, duration: 2 ms}"
+    forge = injector("forge", "{bus: to_drives, cob_id: 0x205}", fault, "{type: at, time: 0.2 s}", more)
+    result = run_scenario(scenario_of(forge))
+    assert result.document["valid"], result.document["invalid_reasons"]
+    assert any(row.bus == DRIVE_BUS for row in error_rows(result.faulted))
+    assert any("8120" in one["text"] for one in result.document["events"])
+
+
+@pytest.mark.parametrize(
+    ("target", "fault", "duration"),
+    [
+        ("{bus: to_drives, cob_id: 0x205}", "{type: insert, cob_id: 0x001, payload: '00', every: 50 us}", "50 ms"),
+        ("{bus: to_controller, pdo: TPDO1}", "{type: delay, law: {type: exponential, mean: 50 ms}}", "0.5 s"),
+    ],
+)
+def test_frames_that_full_queues_lose_because_of_a_fault_are_told_and_the_run_is_valid(
+    target: str, fault: str, duration: str
+) -> None:
+    """Frames in addition, or held back and released at once."""
+    more = f"effect: {{type: constant_time, duration: {duration}}}"
+    result = run_scenario(scenario_of(injector("flood", target, fault, "{type: at, time: 0.2 s}", more)))
+    document = result.document
+    lost = {name: bus["queue_overflows"] for name, bus in document["bus"].items() if bus["queue_overflows"]}
+    assert document["valid"], document["invalid_reasons"]
+    assert lost
+    for name, count in lost.items():
+        assert f"{name} bus: {count} frames lost in full transmit queues, as faults had it" in summary_text(document)
+
+
 def test_an_ideal_bus_stays_ideal_beside_one_with_errors() -> None:
     """A Wire is on the bus of the fault only; without wire faults there is none, and no error row."""
     result = run_scenario(scenario_of(injector("flip", "{wire: controller}", "{type: bit_error, field: crc}")))

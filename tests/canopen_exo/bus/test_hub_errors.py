@@ -22,6 +22,7 @@ from canopen_exo.bus.hub_wire import (
 )
 from canopen_exo.bus.medium import QUEUE_LENGTH
 from canopen_exo.bus.node import MS, NEVER
+from canopen_exo.bus.recovery import RECESSIVE_BITS
 
 MBIT = 1_000_000
 BIT = 1000
@@ -60,9 +61,9 @@ def hub_with(*disturbances: Disturbance) -> Hub:
     return Hub(MBIT, make)
 
 
-def join(hub: Hub, options: int = 0) -> Client:
+def join(hub: Hub, options: int = 0, now: int = 0) -> Client:
     client = Client("test")
-    hub.received(client, pack_hello("drive", options), 0)
+    hub.received(client, pack_hello("drive", options), now)
     client.outbox.clear()
     return client
 
@@ -197,7 +198,33 @@ def test_late_hub_moves_no_frame(step: int) -> None:
         receiver.outbox.clear()
         ends += [unpack_record(data, at)[4] // BIT for at in range(0, len(data), 24) if not data[at + 1]]
     failed = LENGTH - 12 + 6 + 8 + 3
-    assert ends == [5 * failed + (one + 1) * LENGTH for one in range(5)]
+    assert ends == [RECESSIVE_BITS + 5 * failed + (one + 1) * LENGTH for one in range(5)]
+
+
+def test_client_that_joins_within_a_frame_neither_hears_it_nor_sends_before_its_end() -> None:
+    """It takes part once it has seen 11 recessive bits, which the end of a frame has."""
+    hub = hub_with()
+    sender, receiver = join(hub), join(hub)
+    send(hub, sender, 2)
+    run(hub, (RECESSIVE_BITS + LENGTH // 2) * BIT)
+    late = join(hub, now=(RECESSIVE_BITS + LENGTH // 2) * BIT)
+    send(hub, late, 1, (RECESSIVE_BITS + LENGTH // 2) * BIT)
+    run(hub, 5 * MS)
+    assert [one[1] for one in told(receiver)] == [0x181] * 3
+    assert [one[1] for one in told(late)] == [0x181]  # the sender's second
+
+
+def test_client_that_joins_an_idle_bus_waits_for_11_bits() -> None:
+    """Its own frame begins then."""
+    hub = hub_with()
+    sender, _ = join(hub), join(hub)
+    run(hub, MS)
+    late = join(hub, now=MS)
+    send(hub, late, 1, MS)
+    run(hub, MS + (RECESSIVE_BITS - 1) * BIT)
+    assert bus_of(hub).medium.end == NEVER
+    run(hub, MS + (RECESSIVE_BITS + LENGTH) * BIT)
+    assert [one[1] for one in told(sender)] == [0x181]
 
 
 def test_python_can_shows_error_frames(start_hub: StartHub) -> None:

@@ -213,6 +213,27 @@ def test_recovery_takes_longer_under_load() -> None:
     assert node.states[1][0] == 128 * LENGTH * BIT
 
 
+def test_port_is_held_off_until_it_is_let_go_as_often() -> None:
+    """Windows that overlap: the first to end does not bring it back, nor does a restart that was asked for before."""
+    node = Talker()
+    bus = Bus([node, Talker()])
+    port = bus.medium.ports[0]
+    port.restart_ns = MS
+    bus.wire.switch_off(0, port)
+    bus.loop.run_until(MS)
+    bus.wire.hold_off(MS, port)
+    bus.wire.hold_off(MS, port)
+    bus.loop.run_until(20 * MS)
+    bus.wire.let_go(20 * MS, port)
+    bus.loop.run_until(40 * MS)
+    assert [state for _, state, _, _ in node.states] == [ErrorState.BUS_OFF]
+    bus.wire.let_go(40 * MS, port, 2 * MS)
+    bus.loop.run_until(60 * MS)
+    assert [(at, state) for at, state, _, _ in node.states[1:]] == [
+        (42 * MS + 128 * 11 * BIT, ErrorState.ERROR_ACTIVE)
+    ]
+
+
 def test_port_without_restart_stays_off() -> None:
     """restart-ms 0 of Linux: somebody must do it."""
     node = Talker()

@@ -14,6 +14,8 @@ from canopen_exo.bus.wire import Wire
 from canopen_exo.errors import CanopenExoError
 from tests.canopen_exo.bus.wire_nodes import BIT, FRAME, LENGTH, Bus, Script, Talker, flip
 
+OTHER = Frame(0x182, bytes(8))
+
 # --- errors that only some see --------------------------------------------------------------------------------------
 
 
@@ -67,6 +69,19 @@ def test_error_in_the_last_bit_of_eof_makes_a_duplicate() -> None:
         (LENGTH, FRAME),
         (LENGTH - 3 + 6 + 8 + 3 + 1 + LENGTH, FRAME),
     ]
+
+
+def test_last_bit_of_eof_at_a_receiver_makes_an_overload_frame_which_is_told_and_is_no_error() -> None:
+    """It has accepted the frame; the sender sees a flag in the intermission, and nobody counts or repeats anything."""
+    bus = Bus([Talker((0, FRAME), (0, OTHER)), Talker(), Talker()], Script([flip(LENGTH - 4, ports=1 << 1)]))
+    bus.loop.run_until(MS)
+    overload, *frames = bus.loop.trace
+    assert (overload.frame.can_id, overload.frame.flags, overload.frame.data[2]) == (0x20000208, FLAG_ERROR, 0x20)
+    assert overload.end_ns == (LENGTH - 3) * BIT
+    assert [row.frame for row in frames] == [FRAME, OTHER]
+    assert [(port.tec, port.rec) for port in bus.medium.ports] == [(0, 0)] * 3
+    assert bus.medium.errors == 0
+    assert frames[1].end_ns > (2 * LENGTH + 6 + 8) * BIT  # the flag, the delimiter, and intermission again
 
 
 def test_error_at_eof_bit_6_of_one_receiver_makes_a_duplicate_for_the_others_only() -> None:
