@@ -72,7 +72,10 @@ def run_realtime(
             golden, faulted = _run_pair(setup, progress, announce, host.processes["hub"])
     else:
         golden, faulted = _run_pair(setup, progress, announce, None)
-    return pair_result(scenario, golden, faulted, time.perf_counter() - started)
+    result = pair_result(scenario, golden, faulted, time.perf_counter() - started)
+    if "gateway" in without:
+        result.document["injectors"] = 0  # not used
+    return result
 
 
 def pair_result(scenario: Scenario, golden: RealTimeRun, faulted: RealTimeRun, wall_time_s: float) -> Result:
@@ -203,7 +206,7 @@ def check_without(scenario: Scenario, without: frozenset[str]) -> None:
         needed = ""
         if "hlc" in without and line.path.startswith("golden.tracking_rmse"):
             needed = "controller"
-        elif "gateway" in without and line.path == "injections":
+        elif "gateway" in without and line.path in ("injections", "manifested"):
             needed = "gateway"
         if needed:
             raise BenchError(f"expect: {line.text!r} needs our {needed}, and it is left out; remove one of them")

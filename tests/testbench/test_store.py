@@ -46,7 +46,7 @@ def runs(run_maker: RunMaker) -> tuple[RunRecord, RunRecord]:
 def files(runs: tuple[RunRecord, RunRecord]) -> dict[str, Writer]:
     golden, faulted = runs
     judgement = judge(SIX, {joint: limits_of(joint) for joint in SIX}, golden, faulted)
-    summary = summary_document("x", 1, golden, faulted, judgement, sim_time_s=1.0, wall_time_s=1.0)
+    summary = summary_document("x", 1, golden, faulted, judgement, injectors=0, sim_time_s=1.0, wall_time_s=1.0)
     return result_files("name: x\n", summary, SIX, golden, faulted)
 
 
