@@ -135,7 +135,7 @@ def _run(options: argparse.Namespace) -> int:
             refuse_wire_faults(scenario.injectors, "exo-hil run --realtime")
         changes = [*options.overrides, *(("replay",) if replay is not None else ())]
         folder = options.out or default_folder(scenario.name, scenario.seed, changes)
-        check_folder(folder)
+        check_folder(folder, scenario.name)
     except (FileErrors, BenchError, FaultError) as error:
         _say(_as_typed(error, options))
         return USAGE

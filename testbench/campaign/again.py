@@ -9,6 +9,7 @@ from testbench.campaign.making.identity import code_version, with_seed
 from testbench.campaign.records import IN_REAL_TIME, NO_STATEMENT, RunRow, RunSpec, Wanted
 from testbench.campaign.store.store import Store
 from testbench.errors import BenchError
+from testbench.scenario import parse_scenario
 from testbench.store import check_folder
 
 
@@ -81,7 +82,7 @@ def make_again(store: Store, name: str, out: Path | None, say: Callable[[str], N
         )
     number = next(number for number, point in store.points.all().items() if point == before.point)
     folder = out or Path("results") / f"{store.meta('name')}-{number}-{before.number}"
-    check_folder(folder)
+    check_folder(folder, parse_scenario(recipe.scenario).name)
     version = code_version()
     if version != recipe.code_version:
         say(f"warning: the run was made by version {recipe.code_version}, this is {version}: it may come out otherwise")

@@ -146,6 +146,28 @@ def test_folder_with_anything_of_somebody_elses_is_refused_untouched(tmp_path: P
     assert names(tmp_path) == ["r"]
 
 
+@pytest.mark.parametrize(
+    ("summary", "is_refused"),
+    [
+        ('{"scenario": "y", "seed": 1}', True),
+        ('{"scenario": "x", "seed": 1}', False),
+        ("{}", False),
+        ("[1]", False),
+        ('{"scenario": 5}', False),
+        ("half of a", False),
+    ],
+)
+def test_result_of_another_scenario_is_refused(tmp_path: Path, summary: str, is_refused: bool) -> None:
+    """A previous result is one of the same scenario, whatever its seed, or one that does not say of which."""
+    write_result(tmp_path / "r", small(summary))
+    check_folder(tmp_path / "r")
+    if is_refused:
+        with pytest.raises(BenchError, match=r"scenario 'y', not of 'x'.*--out"):
+            check_folder(tmp_path / "r", "x")
+    else:
+        check_folder(tmp_path / "r", "x")
+
+
 def test_file_in_the_way_is_refused_untouched(tmp_path: Path) -> None:
     """A file is no folder, neither at the place nor above it."""
     (tmp_path / "r").write_text("mine")
