@@ -15,9 +15,11 @@ import pytest
 
 import testbench.campaign.making.pool
 import testbench.cli_campaign
+from testbench.campaign.again import changes_of
 from testbench.campaign.records import Outcome, RunRow
 from testbench.campaign.store.store import open_store
 from testbench.cli import main
+from testbench.summary import summary_text
 from tests.testbench.campaign.campaigns import written
 from tests.testbench.campaign.test_runner import Here
 from tests.testbench.campaign.workers import HERE, row_of
@@ -410,6 +412,8 @@ def test_replay_makes_a_run_again_with_everything(tmp_path: Path) -> None:
     document = json.loads(out)
     (row,) = [row for row in rows_in(store) if row.point.parameters == (("duration", "0.3 s"),)]
     assert document["same"] is True
+    assert (document["run"], document["parameters"]) == ("2/0", {"duration": "0.3 s"})
+    assert "injectors.freeze.effect.duration=0.3 s" in document["changes"]
     assert document["trace_hash"]["now"] == row.trace_hash
     summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
     assert summary["trace_hash"]["faulted"] == row.trace_hash
@@ -417,6 +421,21 @@ def test_replay_makes_a_run_again_with_everything(tmp_path: Path) -> None:
     there = tmp_path / "s-runs" / row.identity[:16]
     assert (there / "injections.csv").read_bytes() == (folder / "injections.csv").read_bytes()
     assert (there / "drive.log").read_bytes() == (folder / "drive.log").read_bytes()
+    done = exo_hil(tmp_path, "campaign", "replay", str(store), "2/0", "--out", str(folder))
+    out, err = done.communicate(timeout=300)
+    first, *lines = out.splitlines()
+    assert first == "run 2/0 of small, seed 5: duration = 0.3 s"
+    changes = ("injectors.freeze.effect.duration=0.3 s", "injectors.zero.effect.duration=0.3 s")
+    assert lines[:2] == [f"      {change}" for change in changes]
+    kept = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    assert summary_text(kept) in out
+    assert lines[-2:] == [f"outcome: {row.outcome.value}", f"the same as in the store: trace hash {row.trace_hash}"]
+    assert f"result folder: {folder}" in err
+    opened = open_store(store, write=True)
+    assert changes_of(opened, row) == changes
+    opened.set_meta({"changes": '["motion.duration=1 s"]'})  # the campaign as run last: another one
+    assert changes_of(opened, row) == ()
+    opened.close()
     done = exo_hil(tmp_path, "campaign", "replay", str(store), "9/0")
     assert "points 1..2" in done.communicate(timeout=300)[1]
     assert done.returncode == 2
