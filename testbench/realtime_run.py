@@ -17,7 +17,7 @@ from fi_gateway.control_socket import ask_listing
 from fi_gateway.errors import FaultError
 from testbench.child import Process, ProcessError
 from testbench.document import RealTimeEntry, RealTimeRunEntry
-from testbench.errors import BenchError
+from testbench.errors import BenchError, RefusedError
 from testbench.merge import IncompleteError, add_reasons, merge, time_zero_of
 from testbench.parts import PartError, read_gateway, read_hlc, read_joints
 from testbench.record import RunRecord
@@ -59,7 +59,8 @@ def run_realtime(
     """Golden run, faulted run, verdict. buses: controller and drive bus, None for an own hub; without: foreign parts.
 
     places: where own hub and live control listen, see Setup; announce: told what foreign software is waited for.
-    Raises BenchError when a run gives nothing to judge: a process died, a part is missing, the motion never began.
+    Raises BenchError when a run gives nothing to judge: a process died, a part is missing, the motion never began;
+    RefusedError when there is no run, because an address or a bus cannot be had.
     """
     check_without(scenario, without)
     started = time.perf_counter()
@@ -120,6 +121,8 @@ def run_once(
             _drive_through(rig, setup, progress)
             rig.stop()
             return _gather(rig, setup)
+    except RefusedError:
+        raise  # not of the run
     except BenchError as error:
         raise type(error)(f"{which}: {error}") from error
 
