@@ -304,6 +304,11 @@ def test_check_says_what_a_campaign_will_do(tmp_path: Path, capsys: pytest.Captu
     out = capsys.readouterr().out
     assert "axis duration: 0.05 s, 0.3 s (2 values), sets injectors.freeze.effect.duration, inj" in out
     assert "2 points; 3 runs a point\nruns: 6; run k of every point has seed 5 + k\ntime: known when" in out
+    figures = "report: {figures: [{x: duration, y: failure, to: 100 ms}, {x: duration, y: failure, from: 100 ms}]}"
+    assert main(["check", str(written(tmp_path, ("seed: 5", f"seed: 5\n{figures}")))]) == 0
+    shown = [line for line in capsys.readouterr().out.splitlines() if line.startswith("figure: ")]
+    assert shown == ["figure: failure over duration to 0.1 s", "figure: failure over duration from 0.1 s"]
+    written(tmp_path)
     assert main(["check", str(path), "--set", "rig.stops=maybe"]) == 2
     assert main(["check", str(path), "--seed", "3"]) == 2
     assert main(["check", str(written(tmp_path, ("runs: 3", "runs: 0")))]) == 2
