@@ -114,6 +114,7 @@ INTERPRETED: Final = {
     "fi_gateway/rng_state.py": "called once an activation",
     "fi_gateway/schema.py": "files are read once, through pydantic",
     "fi_gateway/target.py": "files are read once, through pydantic",
+    "fi_gateway/unplaced.py": "complaints about files",
     "hlc/dmp.py": "learning is numpy; two short calls a cycle are not",
     "hlc/dynamics.py": "MuJoCo and numpy, whole arrays",
     "hlc/gait.py": "numpy, whole arrays",

@@ -29,6 +29,7 @@ _INTEGER: Final = re.compile(r"[-+]?[0-9]{1,30}|0x[0-9a-fA-F]{1,24}", re.ASCII)
 _FLOAT: Final = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?", re.ASCII)
 _BREAKS: Final = re.compile("[\x85\u2028\u2029\ufeff]")
 _FLOW: Final = re.compile(r"[\[\]{},#\n]")
+_SCALAR: Final = "'<scalar>'"
 _NOT_FINITE: Final = re.compile(r"[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)")
 _WORDS: Final[dict[str, bool | None]] = {
     **dict.fromkeys(("true", "True", "TRUE"), True),
@@ -280,7 +281,8 @@ class _UnreadableError(Exception):
 def _read(document: Document, text: str) -> None:
     """Fill the document; raises _UnreadableError on a syntax error."""
     try:
-        document.data = _Reader(document, text).document()
+        reader = _Reader(document, text)
+        document.data = reader.document()
     except yaml.reader.ReaderError as error:
         line = text.count("\n", 0, error.position) + 1
         column = error.position - text.rfind("\n", 0, error.position)
@@ -289,7 +291,23 @@ def _read(document: Document, text: str) -> None:
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line, column = (mark.line + 1, mark.column + 1) if mark else (1, 1)
-        raise _UnreadableError(line, column, _syntax(error)) from None
+        message = _unclosed(error, text, reader.innermost()) or _syntax(error)
+        raise _UnreadableError(line, column, message) from None
+
+
+def _unclosed(error: yaml.MarkedYAMLError, text: str, innermost: yaml.Mark | None) -> str:
+    """About a bracket that may be many lines before the place where it can no longer be right; "" for another error."""
+    if innermost is None or not (error.context or "").startswith("while parsing a flow "):
+        return ""
+    place = f"line {innermost.line + 1}, column {innermost.column + 1}"
+    opened = f"YAML syntax: the {text[innermost.index]!r} of {place} is not closed"
+    problem = error.problem or ""
+    if problem.endswith(("<stream end>'", "<document start>'", "<document end>'")):
+        return opened
+    expected, _, found = problem.partition(", but got ")
+    if not expected.startswith("expected ',' or "):
+        return ""
+    return f"{opened}, or a ',' is missing, before this {'value' if found == _SCALAR else found}"
 
 
 def _syntax(error: yaml.MarkedYAMLError) -> str:
@@ -297,7 +315,8 @@ def _syntax(error: yaml.MarkedYAMLError) -> str:
     if "'\\t'" in problem:
         return "a tab stands where YAML wants spaces; indent with spaces"
     if problem.startswith("mapping values are not allowed"):
-        return "YAML syntax: a second ': ' in one line; put quotes around a text that contains ': '"
+        remedy = "put quotes around a text that contains ': ', or { } around keys with their values"
+        return f"YAML syntax: a second ': ' in one line; {remedy}"
     context = f" {error.context}," if error.context else ""
     return f"YAML syntax:{context} {problem}"
 
@@ -322,6 +341,10 @@ class _Reader:
             text = "a second document starts here; one file holds one document"
             self._into.problems.append(Problem((), _mark(after), text))
         return data
+
+    def innermost(self) -> yaml.Mark | None:
+        """Where the innermost list or mapping begins that has not ended."""
+        return self._events.marks[-1] if self._events.marks else None
 
     def _peek(self) -> yaml.Event:
         try:

@@ -26,6 +26,7 @@ from fi_gateway.target import Place, TargetSpec, resolve, resolve_wire
 from fi_gateway.timing_specs import EffectChoice, EventChoice, Timing
 from fi_gateway.trigger import Report
 from fi_gateway.trigger_specs import RepairSpec, ReportSpec, TriggerSpec
+from fi_gateway.unplaced import complaint, meant
 
 WIRE_NEEDS: Final = "a run in virtual time (`exo-hil run`) can, and noise `exo-hil hub --timed --errors`"
 """Who can do wire faults."""
@@ -52,13 +53,9 @@ class InjectorSpec(SpecModel):
 
     def __post_init__(self) -> None:
         """The keys about the number of windows agree; raises ValueError."""
-        most = self.max_activations
-        if self.rearm is False and most is not None and most > 1:
-            raise ValueError(f"rearm: false allows one activation, max_activations {most}; leave one of them out")
-        if self.rearm is True and most == 1:
-            raise ValueError("max_activations: 1 leaves nothing to rearm for; leave one of them out")
-        if isinstance(self.effect, InfiniteSpec) and (self.rearm or (most is not None and most > 1)):
-            raise ValueError("an infinite effect never ends, so that nothing comes after it; give another effect")
+        text = _windows_text(self.effect, self.rearm, self.max_activations)
+        if text:
+            raise ValueError(text)
 
     def rearms(self) -> bool | None:
         """As the engine takes it; None: as the effect says."""
@@ -73,13 +70,27 @@ class InjectorSpec(SpecModel):
         return Timing(self.event, self.effect, self.rearms(), self.max_activations or 0)
 
 
+def _windows_text(effect: EffectChoice | None, rearm: bool | None, most: int | None) -> str:
+    """What is wrong with the number of windows, "" for nothing. effect: None when it cannot be read."""
+    if rearm is False and most is not None and most > 1:
+        return f"rearm: false allows one activation, max_activations {most}; leave one of them out"
+    if rearm is True and most == 1:
+        return "max_activations: 1 leaves nothing to rearm for; leave one of them out"
+    if isinstance(effect, InfiniteSpec) and (rearm or (most is not None and most > 1)):
+        return "an infinite effect never ends, so that nothing comes after it; give another effect"
+    return ""
+
+
 Complain = Callable[[Keys, str], None]
 """Takes a complaint: where, counted from `injectors`, and what."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Parts(SpecModel):
-    """What of an injector can be checked against the rest of the file; None: not there, or not readable."""
+    """What of an injector can be checked against the rest of the file; None: not there, or not readable.
+
+    meant: what can be read of a target that cannot be read as a whole.
+    """
 
     target: TargetSpec | None = None
     fault: FaultChoice | None = None
@@ -87,6 +98,9 @@ class _Parts(SpecModel):
     repair: RepairSpec | None = None
     event: EventChoice | None = None
     effect: EffectChoice | None = None
+    rearm: Flag | None = None
+    max_activations: Count | None = None
+    meant: TargetSpec | None = None
 
 
 def check_injectors(injectors: Mapping[str, Data], plan: BusPlan, report: Complain) -> None:
@@ -97,12 +111,24 @@ def check_injectors(injectors: Mapping[str, Data], plan: BusPlan, report: Compla
     parts = {}
     for name, given in injectors.items():
         found = given if isinstance(given, dict) else {}
-        keys = ("target", "fault", "trigger", "repair", "event", "effect")
-        read = [validate(_Parts, {key: found.get(key)}, (), None) or _Parts() for key in keys]
-        parts[name] = _Parts(
-            read[0].target, read[1].fault, read[2].trigger, read[3].repair, read[4].event, read[5].effect
-        )
+        known = _readable(_Parts, found)
+        if "target" not in known:
+            known["meant"] = _readable(TargetSpec, found.get("target"))
+        sources = _readable(TriggerSpec, found.get("trigger"), ("any", "all"))
+        if "trigger" not in known and len(sources) == 1:
+            known["trigger"] = sources
+        parts[name] = validate(_Parts, known, (), None) or _Parts()
     _check(parts, plan, report)
+
+
+def _readable(model: type[SpecModel], given: Data, keys: tuple[str, ...] = ()) -> dict[str, Data]:
+    """Those keys of a mapping that can be read each by itself; keys: which, () for all."""
+    found = given if isinstance(given, dict) else {}
+    return {
+        key: value
+        for key, value in found.items()
+        if (not keys or key in keys) and validate(model, {key: value}, (), None) is not None
+    }
 
 
 def _check(parts: Mapping[str, _Parts], plan: BusPlan, report: Complain) -> None:
@@ -110,9 +136,14 @@ def _check(parts: Mapping[str, _Parts], plan: BusPlan, report: Complain) -> None
     for name, part in parts.items():
         if part.target is not None:
             _check_place(name, part.target, part, plan, report)
+        elif part.meant is not None:
+            _check_unplaced(name, part.meant, part, plan, report)
         for key, timed in (("event", part.event), ("effect", part.effect)):
             if timed is not None:
                 _check_timed(name, key, timed, plan, report)
+        windows = _windows_text(part.effect, part.rearm, part.max_activations)
+        if windows:
+            report((name,), windows)
     for name, trigger in triggers.items():
         sources = trigger.sources
         for number, source in enumerate(sources):
@@ -131,17 +162,30 @@ def _check_place(name: str, target: TargetSpec, part: _Parts, plan: BusPlan, rep
         place = _place(target, part.fault, plan)
     except SpecError as error:
         report((name, "target", *error.keys), str(error))
+        _check_unplaced(name, target, part, plan, report)
         return
-    if place.wire and part.repair is not None:
+    repair = part.repair
+    if place.wire and repair is not None:
         report((name, "repair"), "a wire fault changes no payload: there is nothing to repair; leave repair out")
-        return
+        repair = None
     if place.wire and not place.cob_ids and part.event is not None:
         _check_wire_event(name, part.event, plan, report)
-    for key, spec in (("fault", part.fault), ("repair", part.repair)):
+    for key, spec in (("fault", part.fault), ("repair", repair)):
         try:
             if spec is not None:
                 spec.build(place)
         except FaultError as error:
+            report((name, key, *_keys(error)), str(error))
+
+
+def _check_unplaced(name: str, target: TargetSpec, part: _Parts, plan: BusPlan, report: Complain) -> None:
+    """What is wrong beside a wrong target, whatever was meant by that."""
+    if isinstance(part.fault, WireFaultSpec) or target.wire is not None:
+        return
+    places = meant(target, plan)
+    for key, spec in (("fault", part.fault), ("repair", part.repair)):
+        error = complaint(spec, places) if spec is not None else None
+        if error is not None:
             report((name, key, *_keys(error)), str(error))
 
 

@@ -34,7 +34,7 @@ TO_CONTROLLER: Final = "to_controller"
 TO_DRIVES: Final = "to_drives"
 
 _HEX: Final = re.compile(r"0x[0-9a-fA-F]{1,8}", re.ASCII)
-_ALL_BITS: Final = 0x7FF
+ALL_BITS: Final = 0x7FF
 
 CONTROLLER: Final = "controller"
 """`node` of the controller's own heartbeat."""
@@ -61,7 +61,7 @@ def cob_id(given: object) -> int:
         given = int(given, 16)
     if not isinstance(given, int) or isinstance(given, bool):
         raise ValueError(f"expected a COB-ID such as 0x185; got {describe_value(given)}")
-    if not 0 <= given <= _ALL_BITS:
+    if not 0 <= given <= ALL_BITS:
         raise ValueError(f"COB-ID {given:#x} is outside 0x0..0x7ff, the 11-bit ids")
     return given
 
@@ -76,11 +76,11 @@ def _masked(given: object) -> tuple[int, int]:
         if found[0] & ~found[1]:
             raise ValueError(f"{given}: bits {found[0] & ~found[1]:#x} are not in the mask, so no COB-ID has them")
         return found
-    return cob_id(given), _ALL_BITS
+    return cob_id(given), ALL_BITS
 
 
 def _show_masked(value: tuple[int, int]) -> str:
-    return f"0x{value[0]:03X}" if value[1] == _ALL_BITS else f"0x{value[0]:03X}/0x{value[1]:03X}"
+    return f"0x{value[0]:03X}" if value[1] == ALL_BITS else f"0x{value[0]:03X}/0x{value[1]:03X}"
 
 
 def _signal_name(given: object) -> str:
@@ -259,10 +259,10 @@ def _kind_place(target: TargetSpec, kind: str, plan: BusPlan) -> Place:
     if kind in ("sync", "nmt"):
         if target.node is not None:
             raise SpecError(("node",), f"kind: {kind} is the controller's alone; leave node out")
-        return _cob_id_place(target, (SYNC if kind == "sync" else NMT, _ALL_BITS), plan)
+        return _cob_id_place(target, (SYNC if kind == "sync" else NMT, ALL_BITS), plan)
     base, direction, size, name = KINDS[kind]
     if target.node == CONTROLLER:
-        return _cob_id_place(target, (HEARTBEAT + MASTER_ID, _ALL_BITS), plan)
+        return _cob_id_place(target, (HEARTBEAT + MASTER_ID, ALL_BITS), plan)
     joints = (plan.joint(target.node),) if target.node is not None else plan.joints
     cob_ids = tuple(base + one.node_id for one in joints)
     what = f"{name} of {target.node if target.node is not None else 'every joint'}"
@@ -302,7 +302,7 @@ def _signal_place(target: TargetSpec, plan: BusPlan) -> Place:
         and (target.cob_id is None or signal.cob_id & target.cob_id[1] == target.cob_id[0])
         and (frames is None or signal.cob_id in frames)
     ]
-    found = [signal for signal in around if wanted in _names(signal)]
+    found = [signal for signal in around if wanted in signal_names(signal)]
     if not found:
         names = list(dict.fromkeys(signal.name for signal in around))
         if not names and target.cob_id is not None:
@@ -324,7 +324,7 @@ def _signal_place(target: TargetSpec, plan: BusPlan) -> Place:
     return _place(target, direction, (signal.cob_id,), signal, size, f"{signal.name} of {signal.node}")
 
 
-def _names(signal: Signal) -> tuple[str, ...]:
+def signal_names(signal: Signal) -> tuple[str, ...]:
     """What a signal may be called in a file."""
     names = signal.name, f"{signal.message}.{signal.name}"
     return (*names, f"0x{signal.index:04X}") if signal.index else names
@@ -354,10 +354,10 @@ def _signals(message: str, node: str, number: int, fields: tuple[tuple[str, int,
 def _cob_id_place(target: TargetSpec, given: tuple[int, int], plan: BusPlan) -> Place:
     """Frames of one COB-ID, or of all that a mask leaves."""
     number, mask = given
-    if mask == _ALL_BITS:
+    if mask == ALL_BITS:
         direction, size, what = _frame(number, plan)
         return _place(target, direction, (number,), None, size, what)
-    cob_ids = tuple(one for one in range(_ALL_BITS + 1) if one & mask == number)
+    cob_ids = tuple(one for one in range(ALL_BITS + 1) if one & mask == number)
     known = [frame for frame in (_frame(one, plan) for one in cob_ids) if frame[0]]
     ways = {direction for direction, _, _ in known}
     sizes = {size for _, size, _ in known} if len(known) == len(cob_ids) else set()

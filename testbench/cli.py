@@ -121,7 +121,7 @@ def _run(options: argparse.Namespace) -> int:
     from fi_gateway.errors import FaultError
     from fi_gateway.marked_yaml import FileErrors
     from fi_gateway.schema import refuse_wire_faults
-    from testbench.errors import BenchError
+    from testbench.errors import BenchError, RefusedError
     from testbench.store import check_folder, default_folder
     from testbench.summary import summary_json, summary_text
 
@@ -135,7 +135,7 @@ def _run(options: argparse.Namespace) -> int:
             refuse_wire_faults(scenario.injectors, "exo-hil run --realtime")
         changes = [*options.overrides, *(("replay",) if replay is not None else ())]
         folder = options.out or default_folder(scenario.name, scenario.seed, changes)
-        check_folder(folder)
+        check_folder(folder, scenario.name)
     except (FileErrors, BenchError, FaultError) as error:
         _say(_as_typed(error, options))
         return USAGE
@@ -160,6 +160,9 @@ def _run(options: argparse.Namespace) -> int:
                 from testbench.run import run_scenario
 
                 result = run_scenario(scenario, progress, None if replay is None else replay.windows)
+    except RefusedError as error:
+        _say(str(error))
+        return USAGE
     except (BenchError, JointEmulatorError, CanopenExoError) as error:
         _say(f"{scenario.name}: run invalid: {error}")
         return INVALID

@@ -157,8 +157,8 @@ class ReplayEntry(TypedDict):
 
 
 class Summary(TypedDict):
-    """The whole document. power_up_s: the first frame, negative; source: plant, or bus when foreign drives were on it;
-    realtime: of a real-time run only; replay: of a replay only.
+    """The whole document. power_up_s: the first frame, negative; injectors: of the scenario, switched on and in use;
+    source: plant, or bus when foreign drives were on it; realtime: of a real-time run only; replay: of a replay only.
     """
 
     scenario: str
@@ -177,6 +177,7 @@ class Summary(TypedDict):
     tolerance_deg: float
     bus: dict[str, BusEntry]
     trace_hash: HashEntry
+    injectors: int
     counts: CountEntry
     injections: list[InjectionEntry]
     joints: dict[str, JointEntry]

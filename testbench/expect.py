@@ -2,7 +2,8 @@
 
 Quantities (values in SI after reading):
 
-    errors, failures, injections                    counts over the 7 s (or however long the motion is)
+    errors, failures, injections, manifested        counts over the 7 s (or however long the motion is); injections are
+                                                    activations, manifested what they changed (testbench.document)
     completed                                       1 when the whole motion was walked, 0 when it was ended early
     golden.tracking_rmse [.JOINT]                   angle: reference against fault-free plant; without a joint the worst
     joints.JOINT.rmse_position | rmse_velocity | rmse_torque      faulted against golden
@@ -16,7 +17,7 @@ from typing import Final
 from fi_gateway.marked_yaml import did_you_mean
 from fi_gateway.quantity import Dimension, describe_value, parse_quantity
 
-COUNTS: Final = ("errors", "failures", "injections", "completed")
+COUNTS: Final = ("errors", "failures", "injections", "manifested", "completed")
 TRACKING: Final = "golden.tracking_rmse"
 JOINT_QUANTITIES: Final = {
     "rmse_position": Dimension.ANGLE,

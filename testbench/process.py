@@ -27,7 +27,7 @@ from canopen_exo.bus.node import MS, NEVER, SECOND, Node
 from canopen_exo.bus.realtime import RealTimeLoop
 from canopen_exo.bus.scheduling import release_fifo, request_fifo
 from canopen_exo.errors import CanopenExoError
-from testbench.errors import BenchError
+from testbench.errors import BenchError, RefusedError
 
 if TYPE_CHECKING:  # numpy, and with it everything heavy
     from hlc.node import HighLevelController
@@ -322,11 +322,11 @@ def _leave_hlc(path: Path, process: Session, controller: "HighLevelController") 
 
 
 def open_bus(bus: BusName | str) -> Channel:
-    """The interface of that name; raises BenchError with one line that says what is missing."""
+    """The interface of that name; raises RefusedError with one line that says what is missing."""
     try:
         return open_channel(parse_bus(bus) if isinstance(bus, str) else bus)
     except CanopenExoError as error:
-        raise BenchError(str(error)) from error
+        raise RefusedError(str(error)) from error
 
 
 def die_with(supervisor: int) -> None:

@@ -17,7 +17,7 @@ from fi_gateway.control_socket import ask_listing
 from fi_gateway.errors import FaultError
 from testbench.child import Process, ProcessError
 from testbench.document import RealTimeEntry, RealTimeRunEntry
-from testbench.errors import BenchError
+from testbench.errors import BenchError, RefusedError
 from testbench.merge import IncompleteError, add_reasons, merge, time_zero_of
 from testbench.parts import PartError, read_gateway, read_hlc, read_joints
 from testbench.record import RunRecord
@@ -59,7 +59,8 @@ def run_realtime(
     """Golden run, faulted run, verdict. buses: controller and drive bus, None for an own hub; without: foreign parts.
 
     places: where own hub and live control listen, see Setup; announce: told what foreign software is waited for.
-    Raises BenchError when a run gives nothing to judge: a process died, a part is missing, the motion never began.
+    Raises BenchError when a run gives nothing to judge: a process died, a part is missing, the motion never began;
+    RefusedError when there is no run, because an address or a bus cannot be had.
     """
     check_without(scenario, without)
     started = time.perf_counter()
@@ -72,7 +73,10 @@ def run_realtime(
             golden, faulted = _run_pair(setup, progress, announce, host.processes["hub"])
     else:
         golden, faulted = _run_pair(setup, progress, announce, None)
-    return pair_result(scenario, golden, faulted, time.perf_counter() - started)
+    result = pair_result(scenario, golden, faulted, time.perf_counter() - started)
+    if "gateway" in without:
+        result.document["injectors"] = 0  # not used
+    return result
 
 
 def pair_result(scenario: Scenario, golden: RealTimeRun, faulted: RealTimeRun, wall_time_s: float) -> Result:
@@ -117,6 +121,8 @@ def run_once(
             _drive_through(rig, setup, progress)
             rig.stop()
             return _gather(rig, setup)
+    except RefusedError:
+        raise  # not of the run
     except BenchError as error:
         raise type(error)(f"{which}: {error}") from error
 
@@ -203,7 +209,7 @@ def check_without(scenario: Scenario, without: frozenset[str]) -> None:
         needed = ""
         if "hlc" in without and line.path.startswith("golden.tracking_rmse"):
             needed = "controller"
-        elif "gateway" in without and line.path == "injections":
+        elif "gateway" in without and line.path in ("injections", "manifested"):
             needed = "gateway"
         if needed:
             raise BenchError(f"expect: {line.text!r} needs our {needed}, and it is left out; remove one of them")

@@ -88,6 +88,7 @@ def result_of(
         golden,
         faulted,
         judgement,
+        injectors=sum(spec.enabled for spec in scenario.injectors.values()),
         sim_time_s=sim_time_s,
         wall_time_s=wall_time_s,
     )

@@ -2,11 +2,13 @@
 
 Everything is written into a new folder beside the target (`.<name>.<writer>.part`), flushed to the disk, and put in
 place by renaming. A previous result is moved aside first and removed last; anything else that stands there is left
-alone and refused. When writing fails or is interrupted, the half-written folder is removed and the previous result is
-back. What a killed process left half-written is removed by the next one that writes to the same place.
+alone and refused, a result of another scenario too. When writing fails or is interrupted, the half-written folder is
+removed and the previous result is back. What a killed process left half-written is removed by the next one that writes
+to the same place.
 After a power cut between the two renames the previous result is left in `.<name>.<writer>.old`, whole.
 """
 
+import json
 import os
 import platform
 import re
@@ -71,10 +73,11 @@ def result_files(
     return files
 
 
-def check_folder(folder: Path) -> None:
+def check_folder(folder: Path, scenario: str = "") -> None:
     """Raise BenchError when a result cannot be put there; call it before the run, not after.
 
-    Allowed: nothing there yet, an empty folder, or a previous result and nothing else.
+    Allowed: nothing there yet, an empty folder, or a previous result and nothing else, of the scenario of that name
+    when one is given.
     """
     folder = _resolved(folder)
     try:
@@ -98,6 +101,22 @@ def check_folder(folder: Path) -> None:
             f"result folder {folder}: it holds {found!r} and is not, or not only, a previous result; nothing was "
             "changed: move it away, or give another place with --out"
         )
+    before = _scenario_in(folder / SUMMARY_FILE)
+    if scenario and before not in ("", scenario):
+        raise BenchError(
+            f"result folder {folder}: it holds a result of the scenario {before!r}, not of {scenario!r}; nothing was "
+            "changed: move it away, or give another place with --out"
+        )
+
+
+def _scenario_in(summary: Path) -> str:
+    """Of which scenario a summary is; "" when it does not say."""
+    try:
+        document = json.loads(summary.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return ""
+    found = document.get("scenario") if isinstance(document, dict) else None
+    return found if isinstance(found, str) else ""
 
 
 def write_result(folder: Path, files: Mapping[str, Writer]) -> Path:

@@ -33,10 +33,11 @@ def summary_document(
     faulted: RunRecord,
     judgement: Judgement,
     *,
+    injectors: int,
     sim_time_s: float,
     wall_time_s: float,
 ) -> Summary:
-    """The document of a judged pair of runs. sim_time_s, wall_time_s: of all runs made for it.
+    """The document of a judged pair of runs. injectors: how many could act; sim_time_s, wall_time_s: of all runs made.
 
     Raises BenchError when any number is not finite.
     """
@@ -64,6 +65,7 @@ def summary_document(
             for bus in faulted.buses
         },
         "trace_hash": {"golden": trace_hash(golden.rows), "faulted": trace_hash(faulted.rows)},
+        "injectors": injectors,
         "counts": _counts(faulted.activations),
         "injections": [_injection(activation, faulted.time0_ns) for activation in faulted.activations],
         "joints": {
@@ -184,8 +186,11 @@ def summary_text(document: Summary) -> str:
     """The document for people: at most MOST_LINES lines of plain text for six joints, columns aligned."""
     load = ", ".join(f"{name} bus {100 * bus['load']:.0f} %" for name, bus in document["bus"].items())
     heading = document["verdict"].upper() if document["valid"] else "INVALID"
+    hollow = _hollow_lines(document)
+    heading += " (no fault acted)" if hollow else ""
     head = [
         f"{heading}  {document['scenario']}, seed {document['seed']}: {_outcome_text(document)}{_unmet_text(document)}",
+        *hollow,
         f"      {document['sim_time_s']:.1f} s simulated in {document['wall_time_s']:.2f} s "
         f"({document['x_realtime']:.1f} x real time); {load}",
         *_real_time_lines(document),
@@ -216,6 +221,18 @@ def _overflow_lines(document: Summary) -> list[str]:
         for name, bus in document["bus"].items()
         if bus["queue_overflows"]
     ]
+
+
+def _hollow_lines(document: Summary) -> list[str]:
+    """Why a pass says nothing of faults, unless an `expect:` line has decided on that, and which line would fail it."""
+    counts, injectors = document["counts"], document["injectors"]
+    if not injectors or counts["manifested"] or document["verdict"] != "pass":
+        return []
+    quantity = "manifested" if counts["activated"] else "injections"
+    if any(entry["text"].split()[0] == quantity for entry in document["expectations"]):
+        return []
+    why = "no activation changed a frame" if counts["activated"] else f"injectors: {injectors}, none was activated"
+    return [f"      {why}; `expect: [{quantity} >= 1]` makes that a failed verdict"]
 
 
 def _unmet_text(document: Summary) -> str:

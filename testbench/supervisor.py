@@ -27,7 +27,7 @@ from canopen_exo.emcy import error_words
 from fi_gateway.control_address import is_path, remove_left
 from fi_gateway.schema import status_watchers
 from testbench.child import Process, ProcessError
-from testbench.errors import BenchError
+from testbench.errors import BenchError, RefusedError
 from testbench.process import DONE, ENDED_EARLY, Orders, open_bus
 from testbench.scenario import Scenario
 from testbench.watch import CONTROLLER_PORT, DRIVE_PORT, Watch, alarms_text
@@ -150,8 +150,8 @@ class Supervisor:
     def start(self, parts: Sequence[str] = PARTS) -> None:
         """Start hub and parts, in order; those that are foreign are waited for all the same, except the controller.
 
-        Raises ProcessError, BenchError for a bus that cannot be opened or a hub that cannot listen, KeyboardInterrupt
-        when asked to end meanwhile.
+        Raises ProcessError, RefusedError for a bus that cannot be opened or an address in use, KeyboardInterrupt when
+        asked to end meanwhile.
         """
         setup = self.setup
         self._scenario_file.write_text(setup.scenario.resolved_yaml(), encoding="utf-8")
@@ -181,7 +181,7 @@ class Supervisor:
             self._hub_address = hub.said(SAYS_HUB)
             if not self._hub_address and (hub.code is not None or self.now() >= limit):
                 why = f"the hub does not listen: {hub.obituary()}"
-                raise BenchError(why) if hub.code == REFUSED else ProcessError(why)
+                raise RefusedError(why) if hub.code == REFUSED else ProcessError(why)
 
     def poll(self) -> None:
         """Hear what has come on the buses, without waiting."""
@@ -392,7 +392,7 @@ class Supervisor:
             text += f"\nthe motion ended because {ended_by}" if ended_by else ""
             text += f"\n{timing}" if timing else ""
         if dead.code == REFUSED and not self._is_started:
-            raise BenchError(text)
+            raise RefusedError(text)
         raise ProcessError(text)
 
     def _idle(self, process: Process) -> None:

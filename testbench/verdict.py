@@ -230,6 +230,7 @@ def quantities(
         "errors": float(errors),
         "failures": float(failures),
         "injections": float(len(faulted.activations)),
+        "manifested": float(sum(one.manifested for one in faulted.activations)),
         "completed": float(faulted.completed),
     }
     if tracking_rmse_rad:

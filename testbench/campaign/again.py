@@ -4,20 +4,33 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from fi_gateway.errors import FaultError
+from testbench.campaign.file.settings import describe_point
 from testbench.campaign.making.execute import Workshop, make_run
 from testbench.campaign.making.identity import code_version, with_seed
 from testbench.campaign.records import IN_REAL_TIME, NO_STATEMENT, RunRow, RunSpec, Wanted
+from testbench.campaign.store.archive import remembered
 from testbench.campaign.store.store import Store
 from testbench.errors import BenchError
+from testbench.run import Result
+from testbench.scenario import parse_scenario
 from testbench.store import check_folder
+from testbench.summary import summary_text
 
 
 @dataclass(frozen=True, slots=True)
 class Again:
-    """The run in the store, the one made now, and where its folder is."""
+    """The run in the store, the one made now, and where its folder is.
 
+    name: POINT/NUMBER and campaign; changes: what the campaign changed in its scenario for this run, as for --set;
+    result: None where there was nothing to judge.
+    """
+
+    name: str
+    changes: tuple[str, ...]
     before: RunRow
     now: RunRow
+    result: Result | None
     folder: Path
 
     @property
@@ -28,9 +41,11 @@ class Again:
     def document(self) -> dict[str, object]:
         """As JSON."""
         return {
+            "run": self.name.partition(" ")[0],
             "identity": self.before.identity,
             "seed": self.before.seed,
             "parameters": dict(self.before.point.parameters),
+            "changes": list(self.changes),
             "outcome": {"store": self.before.outcome.value, "now": self.now.outcome.value},
             "trace_hash": {"store": self.before.trace_hash, "now": self.now.trace_hash},
             "same": self.same,
@@ -38,12 +53,18 @@ class Again:
         }
 
     def text(self) -> str:
-        """In words."""
-        told = f"{self.now.outcome.value}{f': {self.now.reason}' if self.now.reason else ''}"
+        """In words: what was made, what came out as `exo-hil run` prints it, and whether it is the same."""
+        lines = [f"run {self.name}, seed {self.before.seed}: {describe_point(self.before.point)}"]
+        lines += [f"      {change}" for change in self.changes]
+        if self.result is not None:
+            lines += summary_text(self.result.document).splitlines()
+        lines.append(f"outcome: {self.now.outcome.value}{f': {self.now.reason}' if self.now.reason else ''}")
         if self.same:
-            return f"{told}\nthe same as in the store: trace hash {self.now.trace_hash}\n"
-        was = f"{self.before.outcome.value}, trace hash {self.before.trace_hash or 'none'}"
-        return f"{told}\nNOT the same as in the store ({was}): trace hash {self.now.trace_hash or 'none'}\n"
+            lines.append(f"the same as in the store: trace hash {self.now.trace_hash}")
+        else:
+            was = f"{self.before.outcome.value}, trace hash {self.before.trace_hash or 'none'}"
+            lines.append(f"NOT the same as in the store ({was}): trace hash {self.now.trace_hash or 'none'}")
+        return "\n".join(lines) + "\n"
 
 
 def find_run(store: Store, name: str) -> RunRow:
@@ -70,6 +91,20 @@ def find_run(store: Store, name: str) -> RunRow:
     return found[0]
 
 
+def changes_of(store: Store, row: RunRow) -> tuple[str, ...]:
+    """`key=value` of all that was set in the scenario for a run, by --set or by its point.
+
+    () when that is not known: the campaign as run last does not make this run, or cannot be read by this version.
+    """
+    try:
+        campaign = remembered(store)
+        if campaign.scenario_text(row.point) != store.runs.recipe(row.identity).scenario:
+            return ()
+        return (*campaign.changes, *(f"{key}={value}" for key, value in campaign.settings.changes(row.point)))
+    except (BenchError, FaultError, KeyError):
+        return ()
+
+
 def make_again(store: Store, name: str, out: Path | None, say: Callable[[str], None]) -> Again:
     """Make the run; says what stands in the way of its being the same. Raises BenchError."""
     before = find_run(store, name)
@@ -80,8 +115,9 @@ def make_again(store: Store, name: str, out: Path | None, say: Callable[[str], N
             "again bit for bit; `traces: always` in the campaign file keeps a result folder of every run"
         )
     number = next(number for number, point in store.points.all().items() if point == before.point)
-    folder = out or Path("results") / f"{store.meta('name')}-{number}-{before.number}"
-    check_folder(folder)
+    campaign = store.meta("name")
+    folder = out or Path("results") / f"{campaign}-{number}-{before.number}"
+    check_folder(folder, parse_scenario(recipe.scenario).name)
     version = code_version()
     if version != recipe.code_version:
         say(f"warning: the run was made by version {recipe.code_version}, this is {version}: it may come out otherwise")
@@ -100,6 +136,9 @@ def make_again(store: Store, name: str, out: Path | None, say: Callable[[str], N
         time_limit_s=float("inf"),
         fork=False,
     )
-    now = make_run(spec, Workshop())
-    say(f"result folder: {folder.resolve()}")
-    return Again(before, now, folder)
+    results: list[Result] = []
+    now = make_run(spec, Workshop(), results.append)
+    if results:
+        say(f"result folder: {folder.resolve()}")
+    name, result = f"{number}/{before.number} of {campaign}", results[0] if results else None
+    return Again(name, changes_of(store, before), before, now, result, folder)

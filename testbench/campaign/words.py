@@ -1,10 +1,11 @@
 """A campaign in sentences: what it will do, and how far it is."""
 
 from collections.abc import Mapping, Sequence
+from math import isfinite
 from typing import Final
 
 from testbench.campaign.file.axes import Axis
-from testbench.campaign.file.rules import FixedRuns, Rule, Until
+from testbench.campaign.file.rules import Figure, FixedRuns, Rule, Until
 from testbench.campaign.file.schema import Campaign
 from testbench.campaign.plans.search import CriticalSearch
 from testbench.campaign.records import NO_STATEMENT, Outcome, Point, RunRow
@@ -61,8 +62,16 @@ def describe_campaign(campaign: Campaign) -> list[str]:
     if campaign.stop_early is not None:
         lines.append(f"a run ends {campaign.stop_early.grace_s:g} s after its first {campaign.stop_early.on}")
     lines.append(f"result folders of single runs: {campaign.traces}; a run may take {campaign.time_limit_s:g} s")
-    lines += [f"figure: {one.y} over {one.x}{', with a quadratic fit' if one.fit else ''}" for one in campaign.figures]
+    units = {axis.name: axis.unit for axis in campaign.axes}
+    lines += [f"figure: {_figure(one, units[one.x])}" for one in campaign.figures]
     return lines
+
+
+def _figure(figure: Figure, unit: str) -> str:
+    """What a figure shows, and of which part of its axis."""
+    ends = (("from", figure.low), ("to", figure.high))
+    part = "".join(f" {word} {end:g} {unit}".rstrip() for word, end in ends if isfinite(end))
+    return f"{figure.y} over {figure.x}{part}{', with a quadratic fit' if figure.fit else ''}"
 
 
 def point_lines(points: Mapping[int, Point], rows: Sequence[RunRow], outcome: str = "failure") -> list[str]:

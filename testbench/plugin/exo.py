@@ -323,7 +323,8 @@ class Exo:
         same = [row for row in self.frames(BUSES[wanted.bus], 2000) if row.frame.can_id == wanted.cob_id][-3:]
         if not same:
             return "; none with that id is among the last frames there"
-        return "; the last with that id there:\n" + "\n".join(self.text_of(row) for row in same)
+        lines = [f"{self.text_of(row)}  {wanted.length_words(row.frame)}".rstrip() for row in same]
+        return "; the last with that id there:\n" + "\n".join(lines)
 
 
 def bus_index(name: str) -> int:

@@ -124,8 +124,18 @@ def pytest_runtest_makereport(
     rig = item.stash.get(_EXO, None)
     if rig is not None and report.failed:
         del item.stash[_EXO]
-        report.sections += _sections(item, rig)
+        if call.excinfo is not None and _is_refused(call.excinfo.value):
+            report.longrepr = call.excinfo.getrepr(style="value", chain=False)
+        else:
+            report.sections += _sections(item, rig)
     return report
+
+
+def _is_refused(error: BaseException) -> bool:
+    """Whether there is no rig, for a bus or an address that cannot be had: nothing but that line is of use then."""
+    from testbench.errors import RefusedError
+
+    return isinstance(error, RefusedError)
 
 
 def named_buses(option: str) -> tuple[str, str] | None:

@@ -3,6 +3,7 @@
 import re
 from typing import Final, final
 
+from canopen_exo.bus.frame import Frame
 from canopen_exo.bus.medium import Transmission
 from testbench.errors import BenchError
 
@@ -31,6 +32,12 @@ class Wanted:
             return f"frame {self.cob_id:03X}"
         shown = " ".join(".." if byte < 0 else f"{byte:02X}" for byte in self._bytes)
         return f"frame {self.cob_id:03X} with data {shown or '(none)'}"
+
+    def length_words(self, frame: Frame) -> str:
+        """That a frame has another length than the data, which is easily overlooked; "" when not."""
+        if self._bytes is None or frame.flags or len(frame.data) == len(self._bytes):
+            return ""
+        return f"length {len(frame.data)}, data has {len(self._bytes)}"
 
     def fits(self, row: Transmission) -> bool:
         """Whether this is one: a classical 11-bit data frame."""

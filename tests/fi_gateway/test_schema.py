@@ -388,6 +388,55 @@ def test_every_complaint_about_every_injector_comes_at_once() -> None:
 
 
 @pytest.mark.parametrize(
+    ("target", "fault", "message"),
+    [
+        ("bus: to_controller, node: knee, signal: position", "bias, value: 5 N m",
+         "'5 N m' is a torque; an angle is wanted"),
+        ("bus: to_master, node: right_knee, signal: position", "bias, value: 5",
+         "position of right_knee: 5 has no unit"),
+        ("bus: to_controller, node: right_knee, signal: positio", "bias, value: much",
+         "position of right_knee: 'much' is not an angle"),
+        ("bus: to_controller, node: right_knee, signal: positio", "bias, value: 5 N m", ""),  # of torque it is right
+        ("bus: to_controller, node: right_knee, signal: positio", "bias, value: 5", ""),  # of statusword
+        ("bus: to_controller, node: right_knee, signal: positio", "drop", "drop loses whole frames"),
+        ("bus: to_controller, node: knee, pdo: TPDO1", "stuck_at_value, value: 0 rpm", "a whole frame"),
+        ("bus: to_controller, node: knee, pdo: TPDO1", "drop", ""),
+        ("bus: to_controller, node: knee, kind: emcy, bits: {start: 0, length: 8}", "bit_flip, positions: [8]",
+         "there is no bit 8"),
+        ("bus: to_controller, node: knee, kind: emcy, bits: {start: 60, length: 8}", "bit_flip, positions: [8]", ""),
+        ("bus: to_controller, node: right_knee", "bias, value: much", ""),
+        ("wire: drive, signal: position", "stuck_dominant", ""),
+    ],
+)  # fmt: skip
+def test_a_fault_beside_a_wrong_target_is_judged_by_all_that_it_may_mean(target: str, fault: str, message: str) -> None:
+    """All errors at once, and no consequences: what some target of that kind would take is not complained of."""
+    first, *others = complaints(a=injector(f"{{type: {fault}}}", f"{{{target}}}"))
+    assert first.startswith("a.target")
+    assert [other.startswith("a.fault") for other in others] == ([True] if message else [])
+    assert message in "".join(others)
+
+
+def test_what_hangs_on_several_keys_is_judged_where_others_are_wrong() -> None:
+    """The sources of a trigger, a repair beside a wrong target, a wire fault with a repair, the number of windows."""
+    checksum = "{checksum: {type: xor, byte: 70}}"
+    said = complaints(
+        a=injector("{type: what}", more=", trigger: {any: [x], on: never}, rearm: false, max_activations: 3"),
+        b=injector(target="{bus: to_controller, node: knee, pdo: TPDO1}", more=f", repair: {checksum}"),
+        c=injector("{type: bit_error, field: crd}", "{wire: drive}", more=", repair: {counter: {start: 0, length: 4}}"),
+    )
+    assert [message.split(": ")[0] for message in said] == [
+        "a",
+        "a.fault.type",
+        "a.trigger.any.0",
+        "a.trigger.on",
+        "b.target.node",
+        "b.repair.checksum.byte",
+        "c.fault.field",
+        "c.repair",
+    ]
+
+
+@pytest.mark.parametrize(
     ("triggers", "circles"),
     [
         ({"a": "", "b": "a", "c": "b"}, []),

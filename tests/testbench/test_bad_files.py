@@ -97,7 +97,7 @@ TABLE: list[tuple[str, ...]] = [
     ("a list as the file", BASE, "§- a\n", "expected a mapping with name, rig, motion", "got a list"),
     ("a word as the file", BASE, "§hello\n", "expected a mapping with name, rig, motion", "got 'hello'"),
     # --- YAML
-    ("bracket not closed", "2020\ninjectors:", "[2020\ninjectors§:", "YAML syntax", "expected ',' or ']'"),
+    ("bracket not closed", "2020\ninjectors:", "[2020\ninjectors§:", "the '[' of line", "is not closed"),
     ("two colons", "seed: 2020", "seed: a§: b", "a second ': ' in one line", "quotes"),
     ("tab", "seed: 2020", "§\tseed: 2020", "a tab", "indent with spaces"),
     ("two documents", "  - failures == 0\n", "  - failures == 0\n§---\nname: b\n", "a second document", "one document"),

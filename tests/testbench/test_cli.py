@@ -226,6 +226,17 @@ def test_folder_of_somebody_else_is_refused_before_the_run(place: Path, capsys: 
 
 
 @pytest.mark.usefixtures("nothing_runs")
+def test_result_of_another_scenario_is_refused_before_the_run(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Its numbers would be gone for a slip of the hand; whose it is, is said."""
+    (place / "r").mkdir()
+    (place / "r" / "summary.json").write_text('{"scenario": "weeks_of_work"}')
+    (place / "r" / "scenario.yaml").write_text("name: weeks_of_work\n")
+    said = refused(capsys, "r")
+    assert "it holds a result of the scenario 'weeks_of_work', not of 'golden'; nothing was changed" in said
+    assert (place / "r" / "summary.json").read_text() == '{"scenario": "weeks_of_work"}'
+
+
+@pytest.mark.usefixtures("nothing_runs")
 @pytest.mark.parametrize("out", ["file", "file/below", "file/far/below"])
 def test_place_that_cannot_be_a_folder_is_refused_before_the_run(
     place: Path, capsys: pytest.CaptureFixture[str], out: str

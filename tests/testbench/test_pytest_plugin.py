@@ -451,11 +451,13 @@ def test_the_same_words_drive_a_rig_on_the_hub(pytester: pytest.Pytester, patien
 
 @pytest.mark.realtime
 def test_a_bus_that_is_not_there_fails_the_test_in_a_line(pytester: pytest.Pytester) -> None:
-    """One line that says what is missing."""
+    """One line that says what is missing, and nothing of a rig that never was."""
     pytester.makepyfile("def test_rig(exo):\n    exo.run_for('1 s')")
     result = run_apart(pytester, "--exo-bus=socketcan:exo_none0,exo_none1")
     result.assert_outcomes(failed=1)
-    result.stdout.fnmatch_lines(["E*BenchError: *socketcan:exo_none*"])
+    result.stdout.fnmatch_lines(
+        ["*= FAILURES =*", "*_ test_rig _*", "bus socketcan:exo_none0: *", "*= short test*"], consecutive=True
+    )
 
 
 def test_the_plug_in_is_no_burden_to_a_process_without_pytest() -> None:

@@ -46,7 +46,7 @@ def runs(run_maker: RunMaker) -> tuple[RunRecord, RunRecord]:
 def files(runs: tuple[RunRecord, RunRecord]) -> dict[str, Writer]:
     golden, faulted = runs
     judgement = judge(SIX, {joint: limits_of(joint) for joint in SIX}, golden, faulted)
-    summary = summary_document("x", 1, golden, faulted, judgement, sim_time_s=1.0, wall_time_s=1.0)
+    summary = summary_document("x", 1, golden, faulted, judgement, injectors=0, sim_time_s=1.0, wall_time_s=1.0)
     return result_files("name: x\n", summary, SIX, golden, faulted)
 
 
@@ -144,6 +144,28 @@ def test_folder_with_anything_of_somebody_elses_is_refused_untouched(tmp_path: P
     assert names(folder) == sorted(content)
     assert all((folder / name).read_text() == "mine" for name in content)
     assert names(tmp_path) == ["r"]
+
+
+@pytest.mark.parametrize(
+    ("summary", "is_refused"),
+    [
+        ('{"scenario": "y", "seed": 1}', True),
+        ('{"scenario": "x", "seed": 1}', False),
+        ("{}", False),
+        ("[1]", False),
+        ('{"scenario": 5}', False),
+        ("half of a", False),
+    ],
+)
+def test_result_of_another_scenario_is_refused(tmp_path: Path, summary: str, is_refused: bool) -> None:
+    """A previous result is one of the same scenario, whatever its seed, or one that does not say of which."""
+    write_result(tmp_path / "r", small(summary))
+    check_folder(tmp_path / "r")
+    if is_refused:
+        with pytest.raises(BenchError, match=r"scenario 'y', not of 'x'.*--out"):
+            check_folder(tmp_path / "r", "x")
+    else:
+        check_folder(tmp_path / "r", "x")
 
 
 def test_file_in_the_way_is_refused_untouched(tmp_path: Path) -> None:

@@ -27,10 +27,12 @@ SIX = ("left_hip", "left_knee", "left_ankle", "right_hip", "right_knee", "right_
 LIMITS = {joint: limits_of(joint) for joint in SIX}
 
 
-def document(golden: RunRecord, faulted: RunRecord, expected: Sequence[str] = ()) -> Summary:
+def document(golden: RunRecord, faulted: RunRecord, expected: Sequence[str] = (), injectors: int = 0) -> Summary:
     lines = [parse_expectation(line, SIX) for line in expected]
     judgement = judge(SIX, LIMITS, golden, faulted, expectations=lines)
-    return summary_document("knee_freeze", 2020, golden, faulted, judgement, sim_time_s=17.0, wall_time_s=2.0)
+    return summary_document(
+        "knee_freeze", 2020, golden, faulted, judgement, injectors=injectors, sim_time_s=17.0, wall_time_s=2.0
+    )
 
 
 @pytest.fixture
@@ -234,3 +236,42 @@ def test_text_of_a_run_without_fault_is_short(run_maker: RunMaker) -> None:
     assert text.startswith("PASS  knee_freeze, seed 2020: no fault was activated\n")
     assert "injections: none\n" in text
     assert len(text.splitlines()) == 11
+
+
+@pytest.mark.parametrize(
+    ("injectors", "windows", "expected", "words"),
+    [
+        (2, 0, [], "injectors: 2, none was activated; `expect: [injections >= 1]` makes that a failed verdict"),
+        (2, 0, ["failures == 0"], "injectors: 2, none was activated"),
+        (2, 1, ["injections >= 1"], "no activation changed a frame; `expect: [manifested >= 1]`"),
+        (2, 0, ["injections == 0"], ""),
+        (2, 1, ["manifested == 0"], ""),
+        (0, 0, [], ""),
+    ],
+)
+def test_a_pass_in_which_no_fault_acted_is_headed_so(
+    run_maker: RunMaker,
+    activation_maker: ActivationMaker,
+    injectors: int,
+    windows: int,
+    expected: list[str],
+    words: str,
+) -> None:
+    """Only with injectors, and where no `expect:` line says what is wanted; the verdict stays pass."""
+    activation = activation_maker()
+    activation.frames_changed = activation.frames_lost = activation.frames_delayed = activation.frames_inserted = 0
+    found = document(run_maker(), run_maker(activations=[activation] * windows), expected, injectors)
+    assert found["verdict"] == "pass"
+    lines = summary_text(found).splitlines()
+    assert lines[0].startswith("PASS (no fault acted)  knee_freeze, seed 2020" if words else "PASS  knee_freeze")
+    assert (words or "simulated in") in lines[1]
+    assert max(len(line) for line in lines) <= 100
+
+
+@pytest.mark.parametrize("line", ["injections >= 1", "manifested >= 1"])
+def test_an_expectation_that_a_fault_acts_fails_a_run_in_which_none_did(run_maker: RunMaker, line: str) -> None:
+    """What CI reads is the exit code."""
+    found = document(run_maker(), run_maker(), [line], 1)
+    assert found["verdict"] == "fail"
+    text = summary_text(found)
+    assert text.startswith("FAIL  knee_freeze, seed 2020: no fault was activated; 1 of 1 expectations not met\n")

@@ -216,15 +216,35 @@ def test_hub_that_cannot_listen_is_told_with_its_last_words(scenario: Scenario) 
     assert "stop what runs there" in str(raised.value)
 
 
-def test_up_refuses_an_address_in_use_like_any_wrong_argument(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("verb", [["up"], ["run", "--realtime"], ["campaign", "run", "--realtime"]], ids=" ".join)
+@pytest.mark.parametrize("option", ["--listen", "--control"])
+def test_an_address_in_use_is_refused_like_any_wrong_argument(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], verb: list[str], option: str
 ) -> None:
-    """Exit code 2, and the reason once."""
+    """Exit code 2, the reason once, and nothing that looks like the result of a run."""
+    monkeypatch.chdir(tmp_path)
     (tmp_path / "rig.yaml").write_text(TEXT)
+    (tmp_path / "campaign.yaml").write_text("name: many\nscenario: rig.yaml\nruns: 1\n")
+    file = "campaign.yaml" if "campaign" in verb else "rig.yaml"
     with socket.create_server(("127.0.0.1", 0)) as taken:
         address = f"127.0.0.1:{taken.getsockname()[1]}"
-        assert main(["up", str(tmp_path / "rig.yaml"), "--listen", address]) == USAGE
-    assert capfd.readouterr().err.count("stop what runs there") == 1
+        assert main([*verb, file, option, address]) == USAGE
+    out, err = capfd.readouterr()
+    assert out == ""
+    assert err.count(f"cannot listen {'on' if option == '--listen' else 'at'} {address}: ") == 1
+    assert err.count("stop what runs there") == 1
+    assert err.count("ended with exit code 2") == 1
+    assert "invalid" not in err
+
+
+def test_a_bus_that_cannot_be_opened_is_no_invalid_run(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """Nobody listens at port 1: exit code 2, one line."""
+    (tmp_path / "rig.yaml").write_text(TEXT)
+    buses = ["--controller-bus", "hub:127.0.0.1:1/controller", "--drive-bus", "hub:127.0.0.1:1/drive"]
+    for verb in (["up"], ["run", "--realtime", "--out", str(tmp_path / "result")]):
+        assert main([*verb, str(tmp_path / "rig.yaml"), *buses]) == USAGE
+        (line,) = capfd.readouterr().err.splitlines()
+        assert line.startswith("hub 127.0.0.1:1/controller: Connection refused; start one with ")
 
 
 @linux

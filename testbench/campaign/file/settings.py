@@ -33,6 +33,10 @@ class Settings:
                 set_value(document, key, value, Mark(document.overrides, 0, origin))
         return scenario_in(document)
 
+    def changes(self, point: Point) -> list[tuple[str, str]]:
+        """(key of the scenario, value) of all that a point sets; raises BenchError, and KeyError for a case."""
+        return [setting for name, text in point.parameters for setting in self._settings(name, text)]
+
     def _settings(self, name: str, text: str) -> Sequence[tuple[str, str]]:
         for axis in self.axes:
             if axis.name == name:

@@ -6,7 +6,7 @@ The golden run of a setting is made once in a process and kept in its Workshop; 
 import gc
 import platform
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
@@ -91,9 +91,10 @@ class Made:
     forked_s: float
 
 
-def make_run(spec: RunSpec, workshop: Workshop) -> RunRow:
+def make_run(spec: RunSpec, workshop: Workshop, kept: Callable[[Result], None] = lambda result: None) -> RunRow:
     """Make one run and judge it. A run that gives nothing to judge comes back as invalid, with the reason.
 
+    kept: told of a result that has got a folder.
     Raises FileErrors and FaultError for a scenario that cannot be run, and FolderError when a result folder cannot be
     written. Nothing here holds `time_limit_s`: whoever has started the process does.
     """
@@ -110,7 +111,9 @@ def make_run(spec: RunSpec, workshop: Workshop) -> RunRow:
         row = judged(spec, scenario, pair, judgement)
         if keeps(spec, row.outcome):
             sim_s, wall_s = made.sim_ns / 1e9, time.perf_counter() - wall  # of the faulted run, golden made before
-            write_kept(spec, result_of(scenario, made.golden.record, made.record, sim_time_s=sim_s, wall_time_s=wall_s))
+            result = result_of(scenario, made.golden.record, made.record, sim_time_s=sim_s, wall_time_s=wall_s)
+            write_kept(spec, result)
+            kept(result)
     return replace(
         row,
         started=started.isoformat(timespec="milliseconds"),

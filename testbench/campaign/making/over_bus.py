@@ -23,7 +23,7 @@ from fi_gateway.schema import refuse_wire_faults
 from testbench.campaign.making.execute import Pair, judged, keeps, write_kept
 from testbench.campaign.making.executor import ATTEMPTS, Executor, FolderError, given_up
 from testbench.campaign.records import IN_REAL_TIME, Outcome, RunRow, RunSpec
-from testbench.errors import BenchError
+from testbench.errors import BenchError, RefusedError
 from testbench.realtime_run import RealTimeRun, check_without, limits_in, pair_result, run_once
 from testbench.record import RunRecord
 from testbench.rig import RigParams
@@ -87,7 +87,7 @@ class OverBus(Executor):
     def collect(self, timeout_s: float) -> list[RunRow]:
         """Make the run that waits, however long it takes; Ctrl-C ends it with KeyboardInterrupt.
 
-        Raises FolderError.
+        Raises FolderError, and RefusedError for an address or a bus that cannot be had.
         """
         return [self._row(self._waiting.popleft())] if self._waiting else []
 
@@ -102,7 +102,7 @@ class OverBus(Executor):
             started, wall = datetime.now(UTC).isoformat(timespec="milliseconds"), time.perf_counter()
             try:
                 row = self._made(spec, scenario)
-            except FolderError:
+            except (FolderError, RefusedError):
                 raise  # not of the run: nobody may take it for one that proves nothing
             except (BenchError, FaultError) as error:
                 row = given_up(spec, Outcome.INVALID, str(error), attempt, 0.0, started)

@@ -25,6 +25,8 @@ NUMBERED: Final = tuple(entry.name for entry in fields(RunRow) if entry.name not
 INJECTION: Final = tuple(entry.name for entry in fields(InjectionRow))
 """Fields of an InjectionRow, all of them columns of `injections`."""
 _TYPES: Final[Mapping[object, str]] = {int: "INTEGER NOT NULL", float: "REAL NOT NULL", float | None: "REAL"}
+_NAME_ONE: Final = "name a store that `exo-hil campaign run` has written"
+_ELSEWHERE: Final = ", or give another place with --out"
 
 
 class StoreError(BenchError):
@@ -69,14 +71,15 @@ CREATE VIEW results AS SELECT * FROM runs WHERE wanted;
 class Database:
     """An open file with the tables. What is done inside of `reading` and `writing` may raise StoreError."""
 
-    def __init__(self, path: Path, connection: sqlite3.Connection) -> None:
+    def __init__(self, path: Path, connection: sqlite3.Connection, *, write: bool) -> None:
         self.path: Final[Path] = path
         self.connection: Final[sqlite3.Connection] = connection
+        self._write: Final[bool] = write
 
     @contextmanager
     def reading(self) -> Iterator[sqlite3.Connection]:
         """All that is read inside is of one moment."""
-        with explained(self.path):
+        with explained(self.path, write=self._write):
             self.connection.execute("BEGIN")
             try:
                 yield self.connection
@@ -86,16 +89,16 @@ class Database:
     @contextmanager
     def writing(self) -> Iterator[sqlite3.Connection]:
         """All that is written inside is kept, or nothing of it."""
-        with explained(self.path), self.connection:
+        with explained(self.path, write=True), self.connection:
             yield self.connection
 
 
 def open_database(path: Path, *, write: bool) -> Database:
     """A file with the tables of this version; with `write` they are made in a new one. Raises StoreError."""
-    with explained(path):
+    with explained(path, write=write):
         connection = sqlite3.connect(path, timeout=30)
     try:
-        with explained(path):
+        with explained(path, write=write):
             version, application = (
                 connection.execute(f"PRAGMA {name}").fetchone()[0] for name in ("user_version", "application_id")
             )
@@ -106,42 +109,42 @@ def open_database(path: Path, *, write: bool) -> Database:
                     f"BEGIN; {_TABLES} PRAGMA application_id = {APPLICATION}; PRAGMA user_version = {FORMAT}; COMMIT;"
                 )
             elif application != APPLICATION:
-                raise StoreError(f"store {path}: this is another SQLite file, not a store of a campaign")
+                told = f"this is another SQLite file, not a store of a campaign; {_NAME_ONE}"
+                raise StoreError(f"store {path}: {told}{_ELSEWHERE if write else ''}")
             elif version != FORMAT:
-                raise StoreError(
-                    f"store {path}: its tables have format {version}, this version writes {FORMAT}; run into a new "
-                    "store with --out"
-                )
+                remedy = "run into a new store with --out" if write else "the version that wrote it reads it"
+                told = f"its tables have format {version}, this version writes {FORMAT}; {remedy}"
+                raise StoreError(f"store {path}: {told}")
             connection.execute("PRAGMA synchronous = FULL")
             connection.execute("PRAGMA foreign_keys = ON")
     except BaseException:
         connection.close()
         raise
-    return Database(path, connection)
+    return Database(path, connection, write=write)
 
 
-_GO_ON: Final = "and start again, or give another place with --out; all runs written before are in it"
+_KEPT: Final = "; all runs written before are in it"
 _WORDS: Final = {
-    "SQLITE_FULL": f"the disk is full; make room {_GO_ON}",
-    "SQLITE_READONLY": f"it may not be written; change its permissions {_GO_ON}",
-    "SQLITE_CANTOPEN": "it cannot be opened; look whether its folder is there and may be written, or give another "
-    "place with --out",
-    "SQLITE_NOTADB": "this is no SQLite file, and was left alone; name a store that `exo-hil campaign run` has "
-    "written, or for a new one another place with --out",
-    "SQLITE_BUSY": f"somebody else is writing to it; end that program {_GO_ON}",
-    "SQLITE_IOERR": "the disk cannot be read or written (full, or a file-size limit reached, or broken); make room "
-    f"{_GO_ON}",
-    "SQLITE_CORRUPT": "the file is damaged; `sqlite3 STORE .recover` gets out what can be; run into a new store with "
-    "--out",
+    "SQLITE_FULL": ("the disk is full; make room and start again", _KEPT),
+    "SQLITE_READONLY": ("it may not be written; change its permissions and start again", _KEPT),
+    "SQLITE_CANTOPEN": ("it cannot be opened; look whether it is a file in a folder that may be written", ""),
+    "SQLITE_NOTADB": (f"this is no SQLite file, and was left alone; {_NAME_ONE}", ""),
+    "SQLITE_BUSY": ("somebody else is writing to it; end that program and start again", _KEPT),
+    "SQLITE_IOERR": (
+        "the disk cannot be read or written (full, or a file-size limit reached, or broken); make room and start again",
+        _KEPT,
+    ),
+    "SQLITE_CORRUPT": ("the file is damaged; `sqlite3 STORE .recover` gets out what can be", ""),
 }
+"""Error of SQLite -> what it is and what to do, and what is said after the remedy of a runner: another place."""
 
 
 @contextmanager
-def explained(path: Path) -> Iterator[None]:
-    """SQLite's errors in our words."""
+def explained(path: Path, *, write: bool) -> Iterator[None]:
+    """SQLite's errors in our words. write: for a runner, who may give another place."""
     try:
         yield
     except sqlite3.Error as error:
         name = getattr(error, "sqlite_errorname", "")
-        words = next((words for code, words in _WORDS.items() if name.startswith(code)), str(error))
-        raise StoreError(f"store {path}: {words}") from error
+        words, after = next((found for code, found in _WORDS.items() if name.startswith(code)), (str(error), ""))
+        raise StoreError(f"store {path}: {words}{_ELSEWHERE if write else ''}{after}") from error

@@ -15,9 +15,11 @@ import pytest
 
 import testbench.campaign.making.pool
 import testbench.cli_campaign
+from testbench.campaign.again import changes_of
 from testbench.campaign.records import Outcome, RunRow
 from testbench.campaign.store.store import open_store
 from testbench.cli import main
+from testbench.summary import summary_text
 from tests.testbench.campaign.campaigns import written
 from tests.testbench.campaign.test_runner import Here
 from tests.testbench.campaign.workers import HERE, row_of
@@ -302,6 +304,11 @@ def test_check_says_what_a_campaign_will_do(tmp_path: Path, capsys: pytest.Captu
     out = capsys.readouterr().out
     assert "axis duration: 0.05 s, 0.3 s (2 values), sets injectors.freeze.effect.duration, inj" in out
     assert "2 points; 3 runs a point\nruns: 6; run k of every point has seed 5 + k\ntime: known when" in out
+    figures = "report: {figures: [{x: duration, y: failure, to: 100 ms}, {x: duration, y: failure, from: 100 ms}]}"
+    assert main(["check", str(written(tmp_path, ("seed: 5", f"seed: 5\n{figures}")))]) == 0
+    shown = [line for line in capsys.readouterr().out.splitlines() if line.startswith("figure: ")]
+    assert shown == ["figure: failure over duration to 0.1 s", "figure: failure over duration from 0.1 s"]
+    written(tmp_path)
     assert main(["check", str(path), "--set", "rig.stops=maybe"]) == 2
     assert main(["check", str(path), "--seed", "3"]) == 2
     assert main(["check", str(written(tmp_path, ("runs: 3", "runs: 0")))]) == 2
@@ -410,6 +417,8 @@ def test_replay_makes_a_run_again_with_everything(tmp_path: Path) -> None:
     document = json.loads(out)
     (row,) = [row for row in rows_in(store) if row.point.parameters == (("duration", "0.3 s"),)]
     assert document["same"] is True
+    assert (document["run"], document["parameters"]) == ("2/0", {"duration": "0.3 s"})
+    assert "injectors.freeze.effect.duration=0.3 s" in document["changes"]
     assert document["trace_hash"]["now"] == row.trace_hash
     summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
     assert summary["trace_hash"]["faulted"] == row.trace_hash
@@ -417,6 +426,21 @@ def test_replay_makes_a_run_again_with_everything(tmp_path: Path) -> None:
     there = tmp_path / "s-runs" / row.identity[:16]
     assert (there / "injections.csv").read_bytes() == (folder / "injections.csv").read_bytes()
     assert (there / "drive.log").read_bytes() == (folder / "drive.log").read_bytes()
+    done = exo_hil(tmp_path, "campaign", "replay", str(store), "2/0", "--out", str(folder))
+    out, err = done.communicate(timeout=300)
+    first, *lines = out.splitlines()
+    assert first == "run 2/0 of small, seed 5: duration = 0.3 s"
+    changes = ("injectors.freeze.effect.duration=0.3 s", "injectors.zero.effect.duration=0.3 s")
+    assert lines[:2] == [f"      {change}" for change in changes]
+    kept = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    assert summary_text(kept) in out
+    assert lines[-2:] == [f"outcome: {row.outcome.value}", f"the same as in the store: trace hash {row.trace_hash}"]
+    assert f"result folder: {folder}" in err
+    opened = open_store(store, write=True)
+    assert changes_of(opened, row) == changes
+    opened.set_meta({"changes": '["motion.duration=1 s"]'})  # the campaign as run last: another one
+    assert changes_of(opened, row) == ()
+    opened.close()
     done = exo_hil(tmp_path, "campaign", "replay", str(store), "9/0")
     assert "points 1..2" in done.communicate(timeout=300)[1]
     assert done.returncode == 2

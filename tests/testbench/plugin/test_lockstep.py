@@ -196,6 +196,8 @@ def test_a_frame_that_does_not_come_fails_with_the_last_ones() -> None:
     text = str(failed.value)
     assert "no frame 2FF with data 03 .. .. .. .. (controller status) on the drive bus within 150 ms, until" in text
     assert text.splitlines()[-1].split()[2:4] == ["2FF", "02"]
+    with pytest.raises(AssertionError, match=r"2FF  02 .* controller status  length 5, data has 8$"):
+        exo.expect(HLC_STATUS, within="30 ms", data="02 .. .. .. .. .. .. ..")
     with pytest.raises(AssertionError, match="none with that id"):
         exo.expect(0x456, within="1 ms")
 

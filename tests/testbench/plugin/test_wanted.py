@@ -35,6 +35,24 @@ def test_the_whole_payload_is_compared(data: bytes | str | None, fits: bool) -> 
 
 
 @pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (None, ""),
+        (b"\x01\x02", ""),
+        (b"\x50\x82\x00", "length 2, data has 3"),
+        (".. .. ..", "length 2, data has 3"),
+        ("50", "length 2, data has 1"),
+        ("", "length 2, data has 0"),
+    ],
+)
+def test_another_length_is_said(data: bytes | str | None, words: str) -> None:
+    """Zeros at the end, or a byte too few, are not seen at a glance."""
+    wanted = Wanted(0x085, data, 1)
+    assert wanted.length_words(Frame(0x085, b"\x50\x82")) == words
+    assert wanted.length_words(Frame(0x085, b"", FLAG_REMOTE)) == ""
+
+
+@pytest.mark.parametrize(
     "other",
     [
         row(Frame(0x086, b"")),
