@@ -130,9 +130,11 @@ def _run(options: argparse.Namespace) -> int:
         buses = _real_time_buses(options)
         if options.realtime:
             from testbench.realtime_run import check_without
+            from testbench.scenario import refuse_queues
 
             check_without(scenario, frozenset(options.without))
             refuse_wire_faults(scenario.injectors, "exo-hil run --realtime")
+            refuse_queues(scenario, "exo-hil run --realtime")
         changes = [*options.overrides, *(("replay",) if replay is not None else ())]
         folder = options.out or default_folder(scenario.name, scenario.seed, changes)
         check_folder(folder, scenario.name)

@@ -346,12 +346,14 @@ def _up(options: argparse.Namespace) -> int:
     from fi_gateway.schema import refuse_wire_faults
     from testbench.child import ProcessError
     from testbench.live import run_up
+    from testbench.scenario import refuse_queues
     from testbench.supervisor import Setup
 
     scenario = read_scenario(options)
     if scenario is None:
         return USAGE
     try:
+        refuse_queues(scenario, "exo-hil up")
         if not options.no_faults:
             refuse_wire_faults(scenario.injectors, "exo-hil up")
         setup = Setup(

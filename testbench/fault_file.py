@@ -22,6 +22,7 @@ from testbench.scenario import (
     Cycle,
     Name,
     Pins,
+    Queues,
     Scenario,
     Seed,
     check_file_injectors,
@@ -44,11 +45,12 @@ _STATUS_NEEDED: Final = (
 
 @dataclass(frozen=True, slots=True)
 class FaultRig(SpecModel):
-    """What a gateway must know of a rig. cycle_ns: control cycle; plant, stops: of a simulated rig, not used here."""
+    """What a gateway must know of a rig. cycle_ns: control cycle; the rest is of a simulated rig, not used."""
 
     plant: Annotated[Literal["suspended"] | None, Later(("walking",))] = None
     stops: Pins | None = None
     cycle_ns: Cycle = 2 * MS
+    queues: Queues = "by_id"
 
 
 @dataclass(frozen=True, slots=True)

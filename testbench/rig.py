@@ -41,12 +41,16 @@ HEARTBEAT_TIMEOUT_MS: Final = 300
 
 @dataclass(frozen=True, slots=True)
 class RigParams:
-    """What a rig is built from. stops: mechanical pins; stride_ns, duration_ns: of the motion, whole control cycles."""
+    """What a rig is built from. stops: mechanical pins; stride_ns, duration_ns: of the motion, whole control cycles.
+
+    has_order: transmit queues are first in, first out.
+    """
 
     plan: BusPlan
     stops: bool
     stride_ns: int
     duration_ns: int
+    has_order: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +81,8 @@ def build_rig(params: RigParams, injectors: list[Injector]) -> Rig:
     loop.connect(gateway, [controller_bus, drive_bus])
     loop.connect(rack, [drive_bus] * len(plan.joints))
     for medium in (controller_bus, drive_bus):
+        for port in medium.ports if params.has_order else ():
+            port.keep_order()
         gateway.join(medium)
         _install_wire(loop, medium, injectors)
     return Rig(params, loop, controller_bus, drive_bus, master, controller, gateway, rack)

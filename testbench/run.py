@@ -111,7 +111,8 @@ def judge_pair(scenario: Scenario, golden: RunRecord, faulted: RunRecord) -> Jud
 
 def rig_params(scenario: Scenario) -> RigParams:
     """What a scenario asks of the rig."""
-    return RigParams(scenario.plan, scenario.rig.stops, scenario.motion.stride_ns, scenario.motion.duration_ns)
+    rig, motion = scenario.rig, scenario.motion
+    return RigParams(scenario.plan, rig.stops, motion.stride_ns, motion.duration_ns, rig.queues == "fifo")
 
 
 def run_rig(

@@ -24,6 +24,7 @@ from fi_gateway.marked_yaml import Data, Document, apply_override, load, parse, 
 from fi_gateway.quantity import describe_value, format_duration, format_hertz, parse_hertz
 from fi_gateway.schema import InjectorSpec, check_injectors, describe_injectors, injector_warnings
 from hlc.limits import limits_of
+from testbench.errors import BenchError
 from testbench.expect import Expectation, parse_expectation
 
 __all__ = [
@@ -147,6 +148,7 @@ Pins: TypeAlias = Annotated[
 ]
 Name: TypeAlias = Annotated[str, BeforeValidator(_name)]
 Seed: TypeAlias = Annotated[int, BeforeValidator(_seed)]
+Queues: TypeAlias = Literal["by_id", "fifo"]
 Cycle: TypeAlias = Annotated[
     int,
     BeforeValidator(_cycle),
@@ -159,13 +161,17 @@ Cycle: TypeAlias = Annotated[
 
 @dataclass(frozen=True, slots=True)
 class Rig(SpecModel):
-    """What is simulated. stops: mechanical pins at the range of travel; cycle_ns: control cycle (key `rate`, in Hz)."""
+    """What is simulated. stops: mechanical pins at the range of travel; cycle_ns: control cycle (key `rate`, in Hz).
+
+    queues: which frame a CAN controller offers first, of the lowest id, or the one that came first.
+    """
 
     later: ClassVar[tuple[str, ...]] = ("file",)
 
     plant: Annotated[Literal["suspended"], Later(("walking",))]
     stops: Pins
     cycle_ns: Cycle = 2 * MS
+    queues: Queues = "by_id"
 
 
 @dataclass(frozen=True, slots=True)
@@ -246,13 +252,24 @@ def scenario_schema() -> dict[str, Data]:
     return json_schema(Scenario)
 
 
+def refuse_queues(scenario: Scenario, what: str) -> None:
+    """Raise BenchError where the transmit queues are those of a kernel or adapter. what: "exo-hil up"."""
+    if scenario.rig.queues != "by_id":
+        raise BenchError(
+            f"rig.queues: {scenario.rig.queues} given, {what} cannot choose: the transmit queues of real buses are the "
+            "kernel's and the adapter's; run it in virtual time (exo-hil run without --realtime), or leave the key out"
+        )
+
+
 def describe(scenario: Scenario) -> list[str]:
     """The scenario in sentences, for `exo-hil check`."""
     rig, motion, plan = scenario.rig, scenario.motion, scenario.plan
     low, high = plan.load()
     pins = "with mechanical stops" if rig.stops else "without mechanical stops"
     lines = [f"{scenario.name}: {scenario.description}" if scenario.description else scenario.name]
-    lines.append(f"rig: {rig.plant}, {pins}, {_rate(rig.cycle_ns)}; bus load {100 * low:.0f} to {100 * high:.0f} %")
+    queues = ", transmit queues first in, first out" if rig.queues == "fifo" else ""
+    load = f"bus load {100 * low:.0f} to {100 * high:.0f} %"
+    lines.append(f"rig: {rig.plant}, {pins}, {_rate(rig.cycle_ns)}{queues}; {load}")
     stride, duration = format_duration(motion.stride_ns), format_duration(motion.duration_ns)
     lines.append(f"motion: {motion.gait}, stride {stride}, {duration} after a fade-in of one stride")
     lines.append(f"seed: {scenario.seed}")

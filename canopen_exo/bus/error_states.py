@@ -9,13 +9,10 @@ from typing import Final, final
 
 from canopen_exo.bus.confinement import BUS_OFF_LIMIT, state_of
 from canopen_exo.bus.error_frame import write_error_frame
-from canopen_exo.bus.frame import FLAG_ERROR, FLAG_EXTENDED, FLAG_REMOTE, Frame
-from canopen_exo.bus.medium import Medium, Port, WireEvent
-from canopen_exo.bus.node import NEVER, ErrorState, Node, PortState
+from canopen_exo.bus.frame import FLAG_ERROR, Frame
+from canopen_exo.bus.medium import CLOSED, Medium, Port, WireEvent
+from canopen_exo.bus.node import NEVER, ErrorState, PortState
 from canopen_exo.bus.recovery import Recovery, is_present
-
-_CLOSED: Final = [(Frame(0x1FFFFFFF, b"", FLAG_EXTENDED | FLAG_REMOTE), Port(Medium("none", 0, 1), Node(), 0))]
-"""The queue of a port that is bus-off: nothing can be put behind what is in it."""
 
 
 @final
@@ -102,15 +99,16 @@ class ErrorStates:
     def _close(self, port: Port) -> None:
         waiting = self.medium.waiting
         kept = [entry for entry in waiting if entry[1] is not port]
-        port.lost += len(waiting) - len(kept)
+        port.lost += len(waiting) - len(kept) + len(port.backlog)
+        port.backlog.clear()
         waiting[:] = kept
-        port.waiting = _CLOSED
+        port.waiting = CLOSED
         self.absent += 1
 
     def _open(self, now: int, port: Port) -> None:
         port.tec = port.rec = 0
         port.ready_ns = now
-        port.waiting = self.medium.waiting
+        port.open()
         self.absent -= 1
 
     def __reduce__(self) -> tuple[type["ErrorStates"], tuple[Medium], dict[str, object]]:

@@ -2,6 +2,8 @@
 
 Source: ISO 11898-1: the frame with the dominant (lowest) arbitration bits wins, the next one starts at
 max(end of the previous frame, arrival); a frame lasts its stuffed bits and the 3-bit intermission.
+A controller offers the frame of its queue with the lowest id, or (`Port.keep_order`) the one that came first: real ones
+differ.
 The time stamp of a frame is the end of its intermission: receivers could act 3 bit times earlier, which moves no
 arbitration, because nobody may start before the bus is idle.
 By itself the bus is ideal: no error ever happens, and nobody is needed to acknowledge. With a Wiring (`wire`) frames
@@ -15,7 +17,7 @@ from typing import Final, final
 
 from mypy_extensions import mypyc_attr
 
-from canopen_exo.bus.frame import FLAG_ERROR, FLAG_FD, Frame
+from canopen_exo.bus.frame import FLAG_ERROR, FLAG_EXTENDED, FLAG_FD, FLAG_REMOTE, Frame
 from canopen_exo.bus.node import MS, NEVER, SECOND, ErrorState, Node, Out, PortState, Relay, open_filter
 from canopen_exo.errors import CanopenExoError
 
@@ -67,15 +69,16 @@ class Listener:
 class Port:
     """One CAN controller on the medium. number: its place there; dropped: frames its full transmit queue refused.
 
-    listeners: who hears what it sends.
+    listeners: who hears what it sends. waiting: where its frames are queued; backlog: of one that keeps the order, the
+    frames behind the one that it offers.
     The rest means something with a Wiring only. tec, rec, state: fault confinement; restart_ns: from bus-off to the
     request to restart, NEVER: it stays off; is_one_shot: a disturbed frame is not sent again; lost: frames that were
     not sent because of that or of bus-off; ready_ns: it may not send before then.
     """
 
     __slots__ = (
-        "dropped", "is_one_shot", "listeners", "lost", "medium", "node", "number", "ready_ns", "rec", "restart_ns",
-        "state", "tec", "waiting",
+        "backlog", "dropped", "is_fifo", "is_one_shot", "listeners", "lost", "medium", "node", "number", "ready_ns",
+        "rec", "restart_ns", "state", "tec", "waiting",
     )  # fmt: skip
 
     def __init__(self, medium: "Medium", node: Node, number: int) -> None:
@@ -85,6 +88,8 @@ class Port:
         self.listeners: list[Listener] = []
         self.dropped: int = 0
         self.waiting: list[tuple[Frame, Port]] = medium.waiting
+        self.is_fifo: bool = False
+        self.backlog: Final[list[Frame]] = []
         self.tec: int = 0
         self.rec: int = 0
         self.state: ErrorState = ErrorState.ERROR_ACTIVE
@@ -96,11 +101,26 @@ class Port:
     @property
     def queued(self) -> int:
         """Frames in its transmit queue: counted when asked for, which is rare, not kept for every frame."""
-        count = 0
+        count = len(self.backlog)
         for _, sender in self.medium.waiting:
             if sender is self:
                 count += 1
         return count
+
+    def keep_order(self) -> None:
+        """From now on it sends first in, first out. To be called while nothing waits."""
+        self.is_fifo = True
+        self.medium.has_order = self.medium.is_special = True
+        self.open()
+
+    def open(self) -> None:
+        """Its queue takes frames. In the place of one that keeps the order lies what nothing can be put behind."""
+        self.waiting = CLOSED if self.is_fifo else self.medium.waiting
+
+    def follow(self) -> None:
+        """The next frame competes, unless the one before does so still."""
+        if self.backlog and self.queued == len(self.backlog):
+            self.medium.insert(self.backlog.pop(0), self)
 
 
 @final
@@ -159,9 +179,10 @@ class Medium:
     end: when the frame on the wire ends, NEVER while idle. on_wire: that frame and its sender, or the last ones.
     waiting: the frames of all transmit queues, each with its sender, in the order in which they will win. Each
     controller offers its lowest arbitration bits first, so one list in order of arbitration (then of arrival) holds all
-    queues. collisions, errors: totals so far, errors being error frames.
+    queues, of those that keep the order the first frame. collisions, errors: totals so far, errors being error frames.
     wire: what can go wrong, None: nothing. is_watched: what is on the wire ends through `wire`. is_restless: a
-    controller will send an error flag though nothing waits. is_special: there is a wire, or the cable is cut.
+    controller will send an error flag though nothing waits. has_order: a controller keeps the order of its frames.
+    is_special: there is a wire, or the cable is cut, or has_order.
     """
 
     def __init__(self, name: str, index: int, bitrate: int) -> None:
@@ -184,6 +205,7 @@ class Medium:
         self.wire: Wiring | None = None
         self.is_watched: bool = False
         self.is_restless: bool = False
+        self.has_order: bool = False
         self.is_special: bool = False
 
     def install(self, wire: Wiring) -> None:
@@ -205,11 +227,21 @@ class Medium:
         if port.state is _BUS_OFF or port.state is _DOWN:
             port.lost += 1
             return
+        if (port.is_fifo or len(self.waiting) >= QUEUE_LENGTH) and port.queued >= QUEUE_LENGTH:
+            port.dropped += 1
+        elif port.is_fifo and (port.queued or self._may_return(port)):
+            port.backlog.append(frame)
+        else:
+            self.insert(frame, port)
+
+    def _may_return(self, port: Port) -> bool:
+        """Its frame is on the wire, and may be disturbed yet."""
+        return self.wire is not None and self.end != NEVER and self.on_wire[1] is port
+
+    def insert(self, frame: Frame, port: Port) -> None:
+        """A frame that competes, among those that wait."""
         waiting = self.waiting
         at = len(waiting)
-        if at >= QUEUE_LENGTH and port.queued >= QUEUE_LENGTH:
-            port.dropped += 1
-            return
         arbitration = frame.arbitration
         while at and waiting[at - 1][0].arbitration > arbitration:
             at -= 1
@@ -221,13 +253,15 @@ class Medium:
 
     def arbitrate(self, now: int) -> None:
         """Start the winning frame. The bus must be idle and a frame must wait; a cut bus starts nothing."""
-        if self.is_special:
-            if not self.is_cut and self.wire is not None:
-                self.wire.start(now)
+        if self.is_cut:
+            return
+        if self.wire is not None:
+            self.wire.start(now)
             return
         self.on_wire = self.waiting.pop(0)
-        frame = self.on_wire[0]
+        frame, port = self.on_wire
         self.end = now + (frame.bits or frame.measure()) * self.bit_ns
+        port.follow()
 
     def cut(self) -> None:
         """Break the cable: the frame on the wire is lost, queues fill up, nothing passes until `mend`."""
@@ -237,8 +271,13 @@ class Medium:
         self.is_watched = False
         if self.wire is not None:
             self.wire.abort()
+        self.on_wire[1].follow()
 
     def mend(self) -> None:
         """Join the cable again; queued frames compete at the next instant."""
         self.is_cut = False
-        self.is_special = self.wire is not None
+        self.is_special = self.wire is not None or self.has_order
+
+
+CLOSED: Final = [(Frame(0x1FFFFFFF, b"", FLAG_EXTENDED | FLAG_REMOTE), Port(Medium("none", 0, 1), Node(), 0))]
+"""In the place of the queue of a port that keeps the order, or is bus-off: nothing can be put behind what is in it."""

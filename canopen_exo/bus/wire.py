@@ -294,6 +294,7 @@ class Wire(Wiring):
                 tec, rec = count(RX_SUCCESS, port.tec, port.rec)
                 self._states.count(now, port, tec, rec, events)
         self._weigh()
+        sender.follow()
         events.append(WireEvent(frame, sender, None))
 
     def _ended(self, now: int) -> None:
@@ -331,6 +332,7 @@ class Wire(Wiring):
         for at, (other, owner) in enumerate(waiting):
             if other is frame and owner is port:
                 del waiting[at]
+                port.follow()
                 return True
         return False
 

@@ -340,7 +340,7 @@ def test_editors_get_a_schema() -> None:
     assert isinstance(rig, dict)
     assert rig["required"] == ["plant", "stops"]
     assert isinstance(rig["properties"], dict)
-    assert list(rig["properties"]) == ["plant", "stops", "rate"]
+    assert list(rig["properties"]) == ["plant", "stops", "rate", "queues"]
     assert schema["additionalProperties"] is rig["additionalProperties"] is False
 
 

@@ -270,3 +270,30 @@ def test_what_has_no_emulated_bus_refuses_the_file_before_anything_runs(
     (message,) = shown.err.splitlines()
     assert message.startswith(f"injectors.knee_off.fault: {what} cannot do bus_off: ")
     assert "`exo-hil run`" in message
+
+
+def test_transmit_queues_that_keep_the_order_are_chosen_in_the_scenario() -> None:
+    """The same frames without a fault; frames released at once leave in another order."""
+    late = injector("late", "{bus: to_controller, pdo: TPDO1}", "{type: delay, law: {type: exponential, mean: 9 ms}}",
+                    more="effect: {type: constant_time, duration: 50 ms}")  # fmt: skip
+    results = [
+        run_scenario(parse_scenario(HEAD + f"  {late}\n", overrides=[f"rig.queues={queues}"]))
+        for queues in ("by_id", "fifo")
+    ]
+    golden = [[frame for _, bus, frame in rows(result.golden) if bus == DRIVE_BUS] for result in results]
+    assert sorted(golden[0]) == sorted(golden[1])
+    assert all(result.document["valid"] for result in results)
+    assert results[0].document["trace_hash"]["faulted"] != results[1].document["trace_hash"]["faulted"]
+
+
+@pytest.mark.parametrize("line", [["up"], ["run", "--realtime"]])
+def test_buses_whose_queues_cannot_be_chosen_refuse_the_scenario(
+    line: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Before anything runs, with what to do."""
+    file = tmp_path / "fifo.yaml"
+    file.write_text(HEAD.replace("rate: 500 Hz", "rate: 500 Hz, queues: fifo").replace("injectors:\n", ""))
+    assert main([*line, str(file)]) == 2
+    said = capsys.readouterr().err
+    assert "rig.queues: fifo given" in said
+    assert "virtual time" in said

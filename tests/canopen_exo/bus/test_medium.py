@@ -121,6 +121,60 @@ def test_all_frames_pass_once_lowest_arbitration_first(queued: list[tuple[int, F
     assert [port.queued for port in medium.ports] == [0, 0, 0, 0]
 
 
+def test_controller_that_keeps_the_order_sends_what_came_first() -> None:
+    """Its urgent frame waits behind its slow one (priority inversion); others pass both of them."""
+    medium = bus()
+    ordered, other = medium.ports
+    ordered.keep_order()
+    for port, can_id in ((ordered, 0x300), (ordered, 0x100), (other, 0x200), (ordered, 0x400), (other, 0x380)):
+        medium.queue(port, Frame(can_id, b""))
+    assert (ordered.queued, other.queued) == (3, 2)
+    assert [frame.can_id for _, _, frame in carried(medium)] == [0x200, 0x300, 0x100, 0x380, 0x400]
+
+
+@given(st.lists(st.tuples(st.integers(0, 2), st.integers(0, 0x7FF)), max_size=40))
+def test_queues_that_keep_the_order_pass_as_a_merge_of_them(queued: list[tuple[int, int]]) -> None:
+    """At each idle bus the lowest of what the controllers offer wins; ports 0 and 1 offer their oldest frame."""
+    medium = bus(3)
+    for port in medium.ports[:2]:
+        port.keep_order()
+    queues: list[list[int]] = [[], [], []]
+    for number, can_id in queued:
+        medium.queue(medium.ports[number], Frame(can_id, b""))
+        queues[number].append(can_id)
+    queues[2].sort()
+    expected = []
+    while any(queues):
+        won = min(queue[0] for queue in queues if queue)
+        expected.append(won)
+        next(queue for queue in queues if queue and queue[0] == won).pop(0)
+    assert [frame.can_id for _, _, frame in carried(medium)] == expected
+
+
+def test_queue_that_keeps_the_order_holds_64_frames() -> None:
+    """One more is dropped and counted."""
+    medium = bus()
+    medium.ports[0].keep_order()
+    for _ in range(QUEUE_LENGTH + 2):
+        medium.queue(medium.ports[0], Frame(0x100, b""))
+    assert (medium.ports[0].queued, medium.ports[0].dropped) == (QUEUE_LENGTH, 2)
+    assert len(carried(medium)) == QUEUE_LENGTH
+
+
+def test_queue_that_keeps_the_order_goes_on_after_a_cut() -> None:
+    """The frame on the wire is lost, the next ones wait."""
+    medium = bus()
+    medium.ports[0].keep_order()
+    for can_id in (0x300, 0x100, 0x200):
+        medium.queue(medium.ports[0], Frame(can_id, b""))
+    medium.arbitrate(0)
+    medium.cut()
+    medium.arbitrate(0)
+    assert medium.end == NEVER
+    medium.mend()
+    assert [frame.can_id for _, _, frame in carried(medium)] == [0x100, 0x200]
+
+
 def test_two_nodes_with_the_same_id_at_once_are_counted() -> None:
     """ISO 11898-1 makes this a bit error; it is counted, and both frames pass."""
     medium = bus(3)

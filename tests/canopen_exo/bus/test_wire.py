@@ -234,6 +234,25 @@ def test_port_is_held_off_until_it_is_let_go_as_often() -> None:
     ]
 
 
+def test_frame_that_is_repeated_keeps_its_place_in_a_queue_that_keeps_the_order() -> None:
+    """Disturbed from the start, or found out to be while it is on the wire; bus-off empties the queue."""
+    urgent = Frame(0x001, b"")
+    bus = Bus([Talker((0, FRAME), (20 * BIT, urgent)), Talker(), Talker()], Script([flip(50)], [flip(50)]))
+    bus.medium.ports[0].keep_order()
+    bus.loop.run_until(2 * MS)
+    assert [row.frame for row in bus.loop.trace if not row.frame.flags] == [FRAME, urgent]
+    again = Bus([Talker((0, FRAME), (0, FRAME), (0, urgent)), Talker()])
+    port = again.medium.ports[0]
+    port.keep_order()
+    again.loop.run_until(20 * BIT)
+    again.wire.switch_off(again.loop.now, port)
+    assert (port.queued, port.lost) == (0, 2)
+    again.loop.run_until(300 * MS)
+    again.medium.queue(port, urgent)
+    again.loop.run_until(301 * MS)
+    assert [row.frame for row in again.loop.trace if not row.frame.flags] == [FRAME, urgent]
+
+
 def test_port_without_restart_stays_off() -> None:
     """restart-ms 0 of Linux: somebody must do it."""
     node = Talker()
