@@ -11,13 +11,13 @@ from numpy.random import Generator
 from pydantic import Field
 
 from canopen_exo.plan import HLC_STATUS, BusPlan
-from fi_gateway.boundary import Count, Flag, SpecError, SpecModel, tag, validate
+from fi_gateway.boundary import Count, Flag, SpecError, SpecModel, Text, tag, validate
 from fi_gateway.chain import draw_chains
 from fi_gateway.effect_specs import InfiniteSpec
 from fi_gateway.errors import FaultError
 from fi_gateway.event_specs import NeverSpec
 from fi_gateway.events import FROM_CONTROLLER
-from fi_gateway.fault_specs import FaultChoice, FaultSpec, WireFaultSpec
+from fi_gateway.fault_specs import FAULTS, FaultChoice, FaultSpec, WireFaultSpec
 from fi_gateway.injector import Injector, Target, stream
 from fi_gateway.marked_yaml import Data, Keys, did_you_mean, dotted
 from fi_gateway.repair import Repair
@@ -79,7 +79,10 @@ Complain = Callable[[Keys, str], None]
 
 @dataclass(frozen=True, slots=True)
 class _Parts(SpecModel):
-    """What of an injector can be checked against the rest of the file; None: not there, or not readable."""
+    """What of an injector can be checked against the rest of the file; None: not there, or not readable.
+
+    word: the type of the fault as written.
+    """
 
     target: TargetSpec | None = None
     fault: FaultChoice | None = None
@@ -87,6 +90,7 @@ class _Parts(SpecModel):
     repair: RepairSpec | None = None
     event: EventChoice | None = None
     effect: EffectChoice | None = None
+    word: Text | None = None
 
 
 def check_injectors(injectors: Mapping[str, Data], plan: BusPlan, report: Complain) -> None:
@@ -99,8 +103,16 @@ def check_injectors(injectors: Mapping[str, Data], plan: BusPlan, report: Compla
         found = given if isinstance(given, dict) else {}
         keys = ("target", "fault", "trigger", "repair", "event", "effect")
         read = [validate(_Parts, {key: found.get(key)}, (), None) or _Parts() for key in keys]
+        fault = found.get("fault")
+        word = fault.get("type") if isinstance(fault, dict) else None
         parts[name] = _Parts(
-            read[0].target, read[1].fault, read[2].trigger, read[3].repair, read[4].event, read[5].effect
+            read[0].target,
+            read[1].fault,
+            read[2].trigger,
+            read[3].repair,
+            read[4].event,
+            read[5].effect,
+            word if isinstance(word, str) else None,
         )
     _check(parts, plan, report)
 
@@ -128,7 +140,7 @@ def _check(parts: Mapping[str, _Parts], plan: BusPlan, report: Complain) -> None
 
 def _check_place(name: str, target: TargetSpec, part: _Parts, plan: BusPlan, report: Complain) -> None:
     try:
-        place = _place(target, part.fault, plan)
+        place = _place(target, part.fault, plan, part.word)
     except SpecError as error:
         report((name, "target", *error.keys), str(error))
         return
@@ -154,9 +166,12 @@ def _check_wire_event(name: str, event: EventChoice, plan: BusPlan, report: Comp
         pass  # reported where the event itself is checked
 
 
-def _place(target: TargetSpec, fault: FaultSpec | None, plan: BusPlan) -> Place:
-    """Of a target on a bus when the fault is one of the wire, or, where it is not readable, when the target says so."""
-    on_wire = isinstance(fault, WireFaultSpec) if fault is not None else target.wire is not None
+def _place(target: TargetSpec, fault: FaultSpec | None, plan: BusPlan, word: str | None = None) -> Place:
+    """Of a target on a bus when the fault is one of the wire; where it is not readable, when its word or the target
+    says so.
+    """
+    kind = FAULTS.built_in.get(word or "") if fault is None else type(fault)
+    on_wire = issubclass(kind, WireFaultSpec) if kind is not None else target.wire is not None
     return resolve_wire(target, plan) if on_wire else resolve(target, plan)
 
 

@@ -602,6 +602,21 @@ def test_every_kind_of_injector_can_be_read_aloud(text: str, words: str) -> None
     assert words in sentence
 
 
+@pytest.mark.parametrize(
+    ("text", "key"),
+    [
+        (injector(event="{type: at, time: .inf}"), "a.event.time"),
+        (injector(event="{type: at, times: .nan}"), "a.event.times"),
+        (injector("{type: noise, uniform: .inf}"), "a.fault.uniform"),
+    ],
+)
+def test_a_value_that_is_no_number_is_not_called_missing_as_well(text: str, key: str) -> None:
+    """One mistake, one complaint: not also "give time (one) or times"."""
+    (said,) = complaints(a=text)
+    assert said.startswith(f"{key}: .")
+    assert said.endswith(" is not a finite number")
+
+
 def test_building_what_was_never_checked_is_refused() -> None:
     """A plan of another rig: the message names injector and key."""
     specs = read(a=injector())
