@@ -37,7 +37,7 @@ _COMPARISON: Final = re.compile(
     re.ASCII,
 )
 _WHOLE: Final = re.compile(r"([+-]?[0-9]{1,20}|0x[0-9a-fA-F]{1,16})\s*(counts|counts/s)?", re.ASCII)
-_COUNTS: Final = {"rad": "counts", "rad/s": "counts/s", "": None}
+_COUNTS: Final = {"rad": "counts", "rad/s": "counts/s", "stride": "counts", "": None}
 _FAR: Final = 1 << 80
 """Beyond every raw value."""
 
