@@ -302,7 +302,7 @@ def _signal_place(target: TargetSpec, plan: BusPlan) -> Place:
         and (target.cob_id is None or signal.cob_id & target.cob_id[1] == target.cob_id[0])
         and (frames is None or signal.cob_id in frames)
     ]
-    found = [signal for signal in around if wanted in _names(signal)]
+    found = [signal for signal in around if wanted in signal_names(signal)]
     if not found:
         names = list(dict.fromkeys(signal.name for signal in around))
         if not names and target.cob_id is not None:
@@ -324,7 +324,7 @@ def _signal_place(target: TargetSpec, plan: BusPlan) -> Place:
     return _place(target, direction, (signal.cob_id,), signal, size, f"{signal.name} of {signal.node}")
 
 
-def _names(signal: Signal) -> tuple[str, ...]:
+def signal_names(signal: Signal) -> tuple[str, ...]:
     """What a signal may be called in a file."""
     names = signal.name, f"{signal.message}.{signal.name}"
     return (*names, f"0x{signal.index:04X}") if signal.index else names
@@ -364,6 +364,11 @@ def _cob_id_place(target: TargetSpec, given: tuple[int, int], plan: BusPlan) -> 
     direction, size = ways.pop() if len(ways) == 1 else "", sizes.pop() if len(sizes) == 1 else -1
     place = _place(target, direction, cob_ids, None, size, "frames", _show_masked(given))
     return replace(place, known=bool(known))
+
+
+def direction_of(number: int, plan: BusPlan) -> str:
+    """Which way the frames of one COB-ID travel: TO_CONTROLLER or TO_DRIVES, "" when the plan has none."""
+    return _frame(number, plan)[0]
 
 
 def _frame(number: int, plan: BusPlan) -> tuple[str, int, str]:

@@ -215,5 +215,5 @@ def test_editors_are_told_of_every_event_and_effect() -> None:
 def test_a_condition_that_does_not_fit_the_rig_stops_the_building() -> None:
     """What was never checked is refused."""
     spec = injector("{type: when, condition: neck.position < 1 deg}")
-    with pytest.raises(FaultError, match="unknown joint 'neck'"):
+    with pytest.raises(FaultError, match="unknown joint or message 'neck'"):
         spec.timing().warnings(resolve(spec.target, PLAN), PLAN, MOTION)
