@@ -155,7 +155,17 @@ def _build(syntax: Syntax, plan: BusPlan, readings: dict[tuple[str, str], Readin
     terms = [term for term, _ in built]
     if syntax.word == "or":
         return AnyOf(terms), any(can_hold for _, can_hold in built)
-    return AllOf(terms), all(can_hold for _, can_hold in built)
+    return AllOf(terms), all(can_hold for _, can_hold in built) and _agree(terms)
+
+
+def _agree(terms: list[Term]) -> bool:
+    """Whether some value of each signal is within all that is asked of it side by side."""
+    spans: dict[tuple[Reading, int], tuple[int, int]] = {}
+    for term in terms:
+        if isinstance(term, Within) and not term.outside:
+            low, high = spans.get((term.reading, term.mask), (term.low, term.high))
+            spans[term.reading, term.mask] = max(low, term.low), min(high, term.high)
+    return all(low <= high for low, high in spans.values())
 
 
 def _compare(part: Comparison, plan: BusPlan, readings: dict[tuple[str, str], Reading]) -> tuple[Term, bool]:

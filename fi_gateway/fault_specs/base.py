@@ -86,6 +86,10 @@ class FaultSpec(SpecModel):
         """Why it changes nothing: "factor is 1"; "" when it does."""
         return ""
 
+    def needs_frames(self) -> bool:
+        """Whether it acts with frames of the target alone, and not by its own clock."""
+        return True
+
 
 def raw_value(given: str | int | float, signal: Signal, key: str = "value") -> int:
     """The raw integer of a value written for that signal, not yet checked for range; raises SpecError at `key`."""

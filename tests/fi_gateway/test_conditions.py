@@ -184,6 +184,15 @@ def test_a_copy_goes_on_alike(payloads: list[bytes]) -> None:
         ("right_knee.statusword & 8 > 8", False),
         ("right_knee.statusword < 0 or right_knee.position < 0 rad", True),
         ("right_knee.statusword < 0 and right_knee.position < 0 rad", False),
+        ("right_knee.position < -60 deg and right_knee.position > 0 deg", False),
+        ("right_knee.position < -60 deg and left_knee.position > 0 deg", True),
+        ("right_knee.position <= 5 counts and right_knee.0x6064 >= 5 counts", True),
+        ("right_knee.position < 5 counts and right_knee.position >= 5 counts", False),
+        ("right_knee.position < 5 counts or right_knee.position > 9 counts", True),
+        ("right_knee.position < 5 counts and (right_knee.position > 9 counts or right_knee.position < 3 counts)", True),
+        ("right_knee.statusword & 8 == 8 and right_knee.statusword & 8 == 0", False),
+        ("right_knee.statusword & 8 == 8 and right_knee.statusword & 4 == 0", True),
+        ("right_knee.statusword == 8 and right_knee.statusword != 7", True),
     ],
 )
 def test_what_signals_cannot_carry_can_never_hold(text: str, can_hold: bool) -> None:
