@@ -145,6 +145,30 @@ def test_each_joint_has_its_panel_one_side_a_column(failed: Plotted) -> None:
     assert titles == ["left hip", "right hip", "left knee", "right knee", "left ankle", "right ankle"]
 
 
+def test_every_joint_shows_reference_golden_and_faulted_run(failed: Plotted) -> None:
+    """All six joints: what was wanted, what came without and with faults; the legend says which is which."""
+    said, runs = failed.faulted.commands, (failed.golden.truth, failed.faulted.truth)
+    figure = joints_figure(failed)
+    panels = {axes.get_title(loc="left").replace(" ", "_"): axes for axes in figure.axes}
+    for k, joint in enumerate(SIX):
+        drawn = [np.asarray(line.get_ydata()) for line in panels[joint].lines]
+        for expected in (np.degrees(said.q_ref[:, k]), *(np.degrees(truth.q[:, k]) for truth in runs)):
+            assert any(one.shape == expected.shape and np.allclose(one, expected) for one in drawn)
+    (legend,) = figure.legends
+    labels = [text.get_text() for text in legend.get_texts()]
+    assert labels == ["golden run", "faulted run", "reference", "limit", "fault active"]
+
+
+def test_what_a_foreign_controller_wanted_is_not_shown(failed: Plotted) -> None:
+    """It says its commands on the bus, and no reference."""
+    nothing = np.zeros((failed.faulted.commands.t_s.size, 0))
+    said = replace(failed.faulted.commands, q_ref=nothing, dq_ref=nothing)
+    view = replace(failed, faulted=replace(failed.faulted, commands=said))
+    for figure, more in ((joints_figure(view), []), (fault_figure(view), ["torque command before clamp"])):
+        labels = [text.get_text().partition(" (")[0] for text in figure.legends[0].get_texts()]
+        assert labels == ["golden run", "faulted run", *more, "limit", "fault active"]
+
+
 def test_windows_of_one_joint_are_joined_where_they_overlap(failed: Plotted) -> None:
     """Chained faults shade one span, not two on top of each other."""
     assert windows(failed, "right_knee") == [(3.0, 3.4), (5.0, 5.3)]
