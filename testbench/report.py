@@ -225,7 +225,8 @@ def _lanes(axes: "Axes", shown: Plotted) -> None:
                 fill = _WINDOW if one.manifested else "none"
                 span = (start / 1e9, (end - start) / 1e9)
                 axes.broken_barh([span], (lane - 0.4, 0.45), facecolor=fill, edgecolor=_WINDOW_EDGE, lw=0.9)
-        injected, manifested = sum(one.frames_injected for one in found), sum(one.manifested for one in found)
+        injected = sum(one.frames_injected + one.attempts_disturbed for one in found)
+        manifested = sum(one.manifested for one in found)
         counts = f"{len(found)} activated, {injected} injected, {manifested} manifested"
         axes.text(0.004, lane + 0.26, counts, fontsize=7, va="center", transform=axes.get_yaxis_transform())
     axes.set_yticks(range(len(names)), [textwrap.shorten(name, 18, placeholder="...") for name in names], fontsize=7)

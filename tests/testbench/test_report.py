@@ -109,6 +109,16 @@ def test_every_injector_has_a_lane_with_its_windows_and_counts(failed: Plotted) 
     assert lane_bars(lanes) == [(3.0, 3.3, True), (5.0, 5.3, True), (3.1, 3.4, True)]
 
 
+def test_attempts_that_a_wire_fault_disturbed_are_counted_as_in_the_document(
+    run_maker: RunMaker, activation_maker: ActivationMaker
+) -> None:
+    """Injected and manifested: attempts to send are what it acts on."""
+    one = activation_maker(signal="right_knee.TPDO1@drive")
+    one.frames_injected, one.frames_changed, one.attempts_disturbed = 0, 0, 12
+    lanes = fault_figure(shown(run_maker(), run_maker(activations=[one]))).axes[3]
+    assert [text.get_text() for text in lanes.texts] == ["1 activated, 12 injected, 12 manifested"]
+
+
 def test_window_that_changed_nothing_is_hollow(run_maker: RunMaker, activation_maker: ActivationMaker) -> None:
     """Activated is not manifested."""
     one = activation_maker()
