@@ -107,6 +107,7 @@ INTERPRETED: Final = {
     "fi_gateway/*control*.py": "called by people and scripts, not per frame",
     "fi_gateway/boundary.py": "files are read once, through pydantic",
     "fi_gateway/chain.py": "drawn once, for people",
+    "fi_gateway/doubts.py": "files are judged once",
     "fi_gateway/fiblock_compat.py": "whole arrays, outside of runs",
     "fi_gateway/marked_yaml.py": "files are read once, through PyYAML",
     "fi_gateway/quantity.py": "files are read once",

@@ -1,7 +1,8 @@
 """The record of one activation of an injector: when, why, and what became of the frames.
 
-Three counts are kept apart, as in fault-injection practice: activated (windows opened), injected (frames the fault
-acted on) and manifested (frames that really came out different, late, in addition, or not at all).
+Three counts are kept apart, as in fault-injection practice: activated (windows that opened), injected (target frames
+the fault acted on, attempts to send that a wire fault disturbed) and manifested (frames changed, lost, delayed or
+inserted, and those attempts). A frame that is inserted, or waits behind a late one, manifests and is not injected.
 """
 
 from typing import Final, final
@@ -42,8 +43,8 @@ class Activation:
     duration_ns: as drawn or given, NEVER for no limit;
     end_ns: first instant outside the window, as planned until it closes; a window without limit keeps NEVER.
     frames_seen: target frames that reached it; frames_unfit: of those, too short to act on; frames_injected: acted on
-    (a drop that spares a frame does not act on it); of those, each at most once: frames_changed: went on at once with
-    other content; frames_lost; frames_delayed: went on later, changed or not, or waited behind one that did.
+    (a drop that spares a frame does not act on it); of those seen, each at most once: frames_changed: went on at once
+    with other content; frames_lost; frames_delayed: went on later, changed or not, or waited behind one that did.
     frames_inserted: further frames. Of a wire fault, attempts_seen: attempts to send a target frame while the window
     was open, a retransmission being one of its own; attempts_disturbed: those, or idle times, in which somebody noticed
     an error, or the bus-off that it made.

@@ -5,8 +5,9 @@
     part       := "(" condition ")" | comparison
     comparison := SIGNAL [ "&" MASK ] OPERATOR VALUE
 
-SIGNAL: `right_knee.position`, `right_knee.0x6064` or `right_knee_TPDO1.position`; OPERATOR: < <= > >= == !=; VALUE: in
-a unit of the signal, or in its counts; MASK: bits of a signal without unit, such as `statusword & 0x6F == 0x27`.
+SIGNAL: `right_knee.position`, `right_knee.0x6064`, or as in the DBC, `right_knee_TPDO1.position`, `HLC_status.phase`;
+OPERATOR: < <= > >= == !=; VALUE: in a unit of the signal, or in its counts; MASK: bits of a signal without unit, such
+as `statusword & 0x6F == 0x27`.
 Left out: `not`, arithmetic, signals compared with each other, values of SDOs.
 """
 
@@ -24,6 +25,7 @@ from fi_gateway.conditions import AllOf, AnyOf, Condition, Reading, Term, Within
 from fi_gateway.events import FROM_CONTROLLER, FROM_DRIVES
 from fi_gateway.marked_yaml import did_you_mean
 from fi_gateway.quantity import QuantityError, describe_value, dimension_of, parse_quantity
+from fi_gateway.target import TO_CONTROLLER, direction_of, service_signals, signal_names
 
 _MAX_TEXT: Final = 1000
 _MAX_DEPTH: Final = 16
@@ -37,7 +39,7 @@ _COMPARISON: Final = re.compile(
     re.ASCII,
 )
 _WHOLE: Final = re.compile(r"([+-]?[0-9]{1,20}|0x[0-9a-fA-F]{1,16})\s*(counts|counts/s)?", re.ASCII)
-_COUNTS: Final = {"rad": "counts", "rad/s": "counts/s", "": None}
+_COUNTS: Final = {"rad": "counts", "rad/s": "counts/s", "stride": "counts", "": None}
 _FAR: Final = 1 << 80
 """Beyond every raw value."""
 
@@ -153,12 +155,22 @@ def _build(syntax: Syntax, plan: BusPlan, readings: dict[tuple[str, str], Readin
     terms = [term for term, _ in built]
     if syntax.word == "or":
         return AnyOf(terms), any(can_hold for _, can_hold in built)
-    return AllOf(terms), all(can_hold for _, can_hold in built)
+    return AllOf(terms), all(can_hold for _, can_hold in built) and _agree(terms)
+
+
+def _agree(terms: list[Term]) -> bool:
+    """Whether some value of each signal is within all that is asked of it side by side."""
+    spans: dict[tuple[Reading, int], tuple[int, int]] = {}
+    for term in terms:
+        if isinstance(term, Within) and not term.outside:
+            low, high = spans.get((term.reading, term.mask), (term.low, term.high))
+            spans[term.reading, term.mask] = max(low, term.low), min(high, term.high)
+    return all(low <= high for low, high in spans.values())
 
 
 def _compare(part: Comparison, plan: BusPlan, readings: dict[tuple[str, str], Reading]) -> tuple[Term, bool]:
     signal = _find(part, plan)
-    port = FROM_DRIVES if signal.message.removeprefix(f"{signal.node}_").startswith("T") else FROM_CONTROLLER
+    port = FROM_DRIVES if direction_of(signal.cob_id, plan) == TO_CONTROLLER else FROM_CONTROLLER
     reading = readings.setdefault((signal.message, signal.name), Reading(port, signal))
     limit = _limit(part, signal)
     low, high = {
@@ -185,15 +197,19 @@ def _find(part: Comparison, plan: BusPlan) -> Signal:
             name = f"0x{int(name, 16):04X}"
         except ValueError:
             raise _error(part, f"{name!r} is not an object such as 0x6064") from None
-    around = [signal for signal in plan.signals() if owner in (signal.node, signal.message)]
+    signals = [*plan.signals(), *service_signals(plan)]
+    around = [signal for signal in signals if owner in (signal.node, signal.message)]
     if not around:
-        names = list(dict.fromkeys(signal.node for signal in plan.signals()))
-        raise _error(part, f"unknown joint {owner!r}{did_you_mean(owner, names)} (this rig has {', '.join(names)})")
-    found = [signal for signal in around if name in (signal.name, f"0x{signal.index:04X}")]
+        nodes = dict.fromkeys(signal.node for signal in signals)
+        hint = did_you_mean(owner, [*nodes, *dict.fromkeys(signal.message for signal in signals)])
+        text = f"unknown joint or message {owner!r}{hint} (this rig has {', '.join(nodes)}, and the messages of the DBC"
+        raise _error(part, f"{text}, such as {signals[-1].message}; what is in SDOs cannot be used)")
+    found = [signal for signal in around if name in signal_names(signal)]
     if not found:
         names = list(dict.fromkeys(signal.name for signal in around))
         hint = did_you_mean(name, names)
-        raise _error(part, f"no PDO carries {name!r} of {owner}{hint} (allowed: {', '.join(names)})")
+        text = f"no signal {name!r} of {owner}{hint} (allowed: {', '.join(names)}; what is in SDOs cannot be used)"
+        raise _error(part, text)
     if len(found) > 1:
         names = [f"{signal.message}.{signal.name}" for signal in found]
         raise _error(part, f"{part.signal} is in several PDOs; write one of {', '.join(names)}")

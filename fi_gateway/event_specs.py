@@ -39,10 +39,10 @@ class EventSpec(SpecModel):
         """The engine's event, drawing from `rng`; raises SpecError for what does not fit the rig."""
         raise NotImplementedError
 
-    def stand_in(self, plan: BusPlan, rng: Generator, frame_ns: int) -> Event | None:
+    def stand_in(self, plan: BusPlan, rng: Generator, frame_ns: int, stride_ns: int = 0) -> Event | None:
         """One that comes as often and needs no frames, to reckon with; None when nobody can tell.
 
-        frame_ns: mean distance of the target's frames, 0 when not known.
+        frame_ns: mean distance of the target's frames; stride_ns: of the gait; 0 when not known.
         """
         return self.build(plan, rng)
 
@@ -119,7 +119,7 @@ class FailureProbabilitySpec(EventSpec):
             return FailureOfFrame(self.p, rng)
         return FailureProbability(self.p, self._period_ns(plan), rng)
 
-    def stand_in(self, plan: BusPlan, rng: Generator, frame_ns: int) -> Event | None:
+    def stand_in(self, plan: BusPlan, rng: Generator, frame_ns: int, stride_ns: int = 0) -> Event | None:
         """Per frame: a grid of the mean distance of frames."""
         if self.per != "frame":
             return self.build(plan, rng)
@@ -226,7 +226,7 @@ class EverySpec(EventSpec):
         """See Every."""
         return Every(self.n)
 
-    def stand_in(self, plan: BusPlan, rng: Generator, frame_ns: int) -> Event | None:
+    def stand_in(self, plan: BusPlan, rng: Generator, frame_ns: int, stride_ns: int = 0) -> Event | None:
         """A certain event on a grid of n mean distances of frames."""
         return FailureProbability(1.0, self.n * frame_ns, rng) if frame_ns else None
 
@@ -237,6 +237,20 @@ class EverySpec(EventSpec):
     def words(self, plan: BusPlan) -> str:
         """For people."""
         return f"with every {self.n}. frame" if self.n > 1 else "with every frame"
+
+
+class _EveryStride(Event):
+    """Once a stride, at times of its own. first_ns: in the first one."""
+
+    def __init__(self, first_ns: int, stride_ns: int) -> None:
+        super().__init__()
+        self._first_ns: Final[int] = first_ns
+        self._stride_ns: Final[int] = stride_ns
+
+    def next(self, after: int) -> int:
+        """The first one not before `after`."""
+        strides = -((self._first_ns - after) // self._stride_ns)
+        return self._first_ns + max(0, strides) * self._stride_ns
 
 
 @dataclass(frozen=True, slots=True)
@@ -255,9 +269,12 @@ class GaitPhaseSpec(EventSpec):
         """See GaitPhase."""
         return GaitPhase(self.phase)
 
-    def stand_in(self, plan: BusPlan, rng: Generator, frame_ns: int) -> Event | None:
-        """The length of a stride is on the bus only."""
-        return None
+    def stand_in(self, plan: BusPlan, rng: Generator, frame_ns: int, stride_ns: int = 0) -> Event | None:
+        """At that phase of every stride from time 0 on, in the nearest control cycle."""
+        if not stride_ns:
+            return None
+        cycles = stride_ns // plan.cycle_ns
+        return _EveryStride(round(self.phase * cycles) % cycles * plan.cycle_ns, stride_ns)
 
     def words(self, plan: BusPlan) -> str:
         """For people."""
@@ -276,7 +293,7 @@ class WhenSpec(EventSpec):
         """See When."""
         return When(resolve_condition(self.condition, plan).condition, self.edge == "rising")
 
-    def stand_in(self, plan: BusPlan, rng: Generator, frame_ns: int) -> Event | None:
+    def stand_in(self, plan: BusPlan, rng: Generator, frame_ns: int, stride_ns: int = 0) -> Event | None:
         """Nobody can tell."""
         return None
 

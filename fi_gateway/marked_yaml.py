@@ -74,8 +74,8 @@ class Problem:
 class Document:
     """Plain data, the marks of its values and of the keys before them, and what is wrong so far.
 
-    source: the file as messages name it. broken: places without usable data; what is said about them or below
-    them later would only be a consequence, and is not reported. overrides: how many were applied.
+    source: the file as messages name it. broken: places without usable data; what is said about them, below them, or
+    of the mapping they are in later would only be a consequence, and is not reported. overrides: how many were applied.
     """
 
     source: str
@@ -101,7 +101,8 @@ class Document:
 
     def report(self, keys: Keys, text: str, at_key: bool = False) -> None:
         """Complain about the value (or the key) at `keys`."""
-        if not any(keys[:depth] in self.broken for depth in range(len(keys) + 1)):
+        below = any(keys[:depth] in self.broken for depth in range(len(keys) + 1))
+        if not below and not any(place[:-1] == keys for place in self.broken if place):
             self.problems.append(Problem(keys, self.mark(keys, at_key), text))
 
     def raise_problems(self) -> None:

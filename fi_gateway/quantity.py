@@ -40,6 +40,7 @@ class Dimension(Enum):
     ANGLE = "angle"
     SPEED = "angular velocity"
     TORQUE = "torque"
+    PHASE = "gait phase"
 
 
 UNITS: Final[dict[Dimension, dict[str, Fraction | float]]] = {
@@ -56,6 +57,7 @@ UNITS: Final[dict[Dimension, dict[str, Fraction | float]]] = {
     Dimension.ANGLE: {"rad": _ONE, "mrad": _MILLI, "deg": _DEGREE},
     Dimension.SPEED: {"rad/s": _ONE, "deg/s": _DEGREE, "rpm": _RPM},
     Dimension.TORQUE: {"N m": _ONE, "mN m": _MILLI},
+    Dimension.PHASE: {"stride": _ONE, "%": Fraction(1, 100)},
 }
 """Unit -> SI per unit; the first unit of each dimension is the SI one. Exact where a fraction."""
 
@@ -75,6 +77,7 @@ _EXAMPLES: Final = {
     Dimension.ANGLE: "5 deg",
     Dimension.SPEED: "65.2 rpm",
     Dimension.TORQUE: "5 N m",
+    Dimension.PHASE: "25 %",
 }
 
 
@@ -200,7 +203,7 @@ def _parse(given: object, dimension: Dimension) -> tuple[Fraction, Fraction | fl
         raise QuantityError(f"{given!r} has no unit; {kind} needs one ({example})")
     if unit not in UNITS[dimension]:
         for other, units in UNITS.items():
-            if unit in units:
+            if unit in units and unit != "%":  # of a stride, or of anything
                 raise QuantityError(f"{given!r} is {_article(other)}; {kind} is wanted ({example})")
         raise QuantityError(f"unknown unit {unit!r} in {given!r}; {kind} is wanted ({example})")
     return _number(match[1], given), UNITS[dimension][unit]

@@ -11,13 +11,12 @@ from numpy.random import Generator
 from pydantic import Field
 
 from canopen_exo.plan import HLC_STATUS, BusPlan
-from fi_gateway.boundary import Count, Flag, SpecError, SpecModel, tag, validate
+from fi_gateway.boundary import Count, Flag, SpecError, SpecModel, Text, tag, validate
 from fi_gateway.chain import draw_chains
 from fi_gateway.effect_specs import InfiniteSpec
 from fi_gateway.errors import FaultError
-from fi_gateway.event_specs import NeverSpec
 from fi_gateway.events import FROM_CONTROLLER
-from fi_gateway.fault_specs import FaultChoice, FaultSpec, WireFaultSpec
+from fi_gateway.fault_specs import FAULTS, FaultChoice, FaultSpec, WireFaultSpec
 from fi_gateway.injector import Injector, Target, stream
 from fi_gateway.marked_yaml import Data, Keys, did_you_mean, dotted
 from fi_gateway.repair import Repair
@@ -65,9 +64,9 @@ class InjectorSpec(SpecModel):
         """Where the fault acts; raises SpecError."""
         return _place(self.target, self.fault, plan)
 
-    def timing(self) -> Timing:
-        """Event and effect together."""
-        return Timing(self.event, self.effect, self.rearms(), self.max_activations or 0)
+    def timing(self, stride_ns: int = 0) -> Timing:
+        """Event and effect together. stride_ns: of the gait, 0 when not known."""
+        return Timing(self.event, self.effect, self.rearms(), self.max_activations or 0, stride_ns)
 
 
 def _windows_text(effect: EffectChoice | None, rearm: bool | None, most: int | None) -> str:
@@ -89,7 +88,7 @@ Complain = Callable[[Keys, str], None]
 class _Parts(SpecModel):
     """What of an injector can be checked against the rest of the file; None: not there, or not readable.
 
-    meant: what can be read of a target that cannot be read as a whole.
+    meant: what can be read of a target that cannot be read as a whole; word: the type of the fault as written.
     """
 
     target: TargetSpec | None = None
@@ -101,6 +100,7 @@ class _Parts(SpecModel):
     rearm: Flag | None = None
     max_activations: Count | None = None
     meant: TargetSpec | None = None
+    word: Text | None = None
 
 
 def check_injectors(injectors: Mapping[str, Data], plan: BusPlan, report: Complain) -> None:
@@ -117,6 +117,10 @@ def check_injectors(injectors: Mapping[str, Data], plan: BusPlan, report: Compla
         sources = _readable(TriggerSpec, found.get("trigger"), ("any", "all"))
         if "trigger" not in known and len(sources) == 1:
             known["trigger"] = sources
+        fault = found.get("fault")
+        word = fault.get("type") if isinstance(fault, dict) else None
+        if isinstance(word, str):
+            known["word"] = word
         parts[name] = validate(_Parts, known, (), None) or _Parts()
     _check(parts, plan, report)
 
@@ -159,7 +163,7 @@ def _check(parts: Mapping[str, _Parts], plan: BusPlan, report: Complain) -> None
 
 def _check_place(name: str, target: TargetSpec, part: _Parts, plan: BusPlan, report: Complain) -> None:
     try:
-        place = _place(target, part.fault, plan)
+        place = _place(target, part.fault, plan, part.word)
     except SpecError as error:
         report((name, "target", *error.keys), str(error))
         _check_unplaced(name, target, part, plan, report)
@@ -198,9 +202,12 @@ def _check_wire_event(name: str, event: EventChoice, plan: BusPlan, report: Comp
         pass  # reported where the event itself is checked
 
 
-def _place(target: TargetSpec, fault: FaultSpec | None, plan: BusPlan) -> Place:
-    """Of a target on a bus when the fault is one of the wire, or, where it is not readable, when the target says so."""
-    on_wire = isinstance(fault, WireFaultSpec) if fault is not None else target.wire is not None
+def _place(target: TargetSpec, fault: FaultSpec | None, plan: BusPlan, word: str | None = None) -> Place:
+    """Of a target on a bus when the fault is one of the wire; where it is not readable, when its word or the target
+    says so.
+    """
+    kind = FAULTS.built_in.get(word or "") if fault is None else type(fault)
+    on_wire = issubclass(kind, WireFaultSpec) if kind is not None else target.wire is not None
     return resolve_wire(target, plan) if on_wire else resolve(target, plan)
 
 
@@ -254,34 +261,6 @@ def _way_back(first: str, triggers: Mapping[str, tuple[str, ...]]) -> tuple[str,
     return ()
 
 
-def injector_warnings(
-    specs: Mapping[str, InjectorSpec], plan: BusPlan, duration_ns: int, by_hand: bool = False
-) -> list[str]:
-    """What is allowed and still looks like a mistake: injectors that can never act in a motion of that length [ns]."""
-    warnings = []
-    live = _live(specs, plan, duration_ns)
-    for name, spec in specs.items():
-        if not spec.enabled:
-            continue
-        place = spec.place(plan)
-        late = [time for time in spec.event.times() if time >= duration_ns and spec.start == "time_zero"]
-        if name not in live and not late and not (by_hand and isinstance(spec.event, NeverSpec)):
-            silent = spec.event.silent(plan)
-            reason = f"its event never happens{'' if isinstance(spec.event, NeverSpec) else f' ({silent})'} and " + (
-                "nothing that triggers it can start" if spec.trigger is not None else "it has no trigger"
-            )
-            warnings.append(f"injectors.{name}: will stay silent: {reason}")
-        if spec.fault.doubts():
-            warnings.append(f"injectors.{name}.fault: changes nothing: {spec.fault.doubts()}")
-        if spec.start == "time_zero":
-            for key, text in spec.timing().warnings(place, plan, duration_ns):
-                warnings.append(f"injectors.{name}.{key}: {text}")
-        if not place.known:
-            cob_ids = place.name.removeprefix("frames ")
-            warnings.append(f"injectors.{name}.target.cob_id: nothing in this rig sends {cob_ids}")
-    return warnings
-
-
 def status_watchers(specs: Mapping[str, InjectorSpec], plan: BusPlan) -> list[str]:
     """The injectors whose event or effect reads the status frames (COB-ID 0x2FF) that our controller alone sends."""
     status, found = (FROM_CONTROLLER, HLC_STATUS), []
@@ -292,40 +271,19 @@ def status_watchers(specs: Mapping[str, InjectorSpec], plan: BusPlan) -> list[st
     return found
 
 
-def _live(specs: Mapping[str, InjectorSpec], plan: BusPlan, duration_ns: int) -> set[str]:
-    """The injectors that can start, by their event or by a chain of triggers."""
-    live: set[str] = set()
-    for name, spec in specs.items():
-        times = spec.event.times()
-        late = len(times) > 0 and times[0] >= duration_ns and spec.start == "time_zero"
-        if spec.enabled and not spec.event.silent(plan) and not late:
-            live.add(name)
-    for _ in specs:
-        for name, spec in specs.items():
-            if spec.enabled and spec.trigger is not None and _can_trigger(spec.trigger, live):
-                live.add(name)
-    return live
-
-
-def _can_trigger(trigger: TriggerSpec, live: set[str]) -> bool:
-    if trigger.probability == 0:
-        return False
-    if trigger.all is not None:
-        return live.issuperset(trigger.all)
-    return trigger.frame is not None or not live.isdisjoint(trigger.sources)
-
-
-def describe_injectors(specs: Mapping[str, InjectorSpec], plan: BusPlan, duration_ns: int) -> list[str]:
-    """One sentence per injector, for a motion of that length [ns]; then who starts whom, drawn."""
+def describe_injectors(
+    specs: Mapping[str, InjectorSpec], plan: BusPlan, duration_ns: int, stride_ns: int = 0
+) -> list[str]:
+    """One sentence per injector, for a motion of that length and stride [ns]; then who starts whom, drawn."""
     chains = draw_chains({name: spec.trigger for name, spec in specs.items() if spec.trigger is not None})
-    lines = [_sentence(name, spec, plan, duration_ns) for name, spec in specs.items()]
+    lines = [_sentence(name, spec, plan, duration_ns, stride_ns) for name, spec in specs.items()]
     return [*lines, "triggers:", *(f"  {line}" for line in chains)] if chains else lines
 
 
-def _sentence(name: str, spec: InjectorSpec, plan: BusPlan, duration_ns: int) -> str:
+def _sentence(name: str, spec: InjectorSpec, plan: BusPlan, duration_ns: int, stride_ns: int) -> str:
     place = spec.place(plan)
     starts = []
-    event = spec.timing().words(name, place, plan, duration_ns)
+    event = spec.timing(stride_ns).words(name, place, plan, duration_ns)
     if event:
         starts.append(event + (" after power-up" if spec.start == "power_up" else ""))
     if spec.trigger is not None:

@@ -366,6 +366,11 @@ def _cob_id_place(target: TargetSpec, given: tuple[int, int], plan: BusPlan) -> 
     return replace(place, known=bool(known))
 
 
+def direction_of(number: int, plan: BusPlan) -> str:
+    """Which way the frames of one COB-ID travel: TO_CONTROLLER or TO_DRIVES, "" when the plan has none."""
+    return _frame(number, plan)[0]
+
+
 def _frame(number: int, plan: BusPlan) -> tuple[str, int, str]:
     """(direction, "" when unknown; payload bytes, -1 when unknown; name) of the frames of one COB-ID."""
     fixed = {NMT: "NMT", SYNC: "SYNC", HLC_STATUS: "HLC status", HEARTBEAT + MASTER_ID: "heartbeat of the controller"}

@@ -3,7 +3,7 @@
 The number of activations is found by playing the engine's own event and effect through many motions, with a generator
 of a fixed seed, so that the dead time of each activation and the end of the motion are in it; frames are taken to come
 at their mean distance. There are enough motions for a standard error of 1 % or so of the number.
-Left out: triggers, and conditions and phases, which only the run itself can tell.
+Left out: triggers, and conditions, which only the run itself can tell.
 """
 
 from dataclasses import dataclass
@@ -40,13 +40,14 @@ class Forecast:
 @dataclass(frozen=True, slots=True)
 class Timing:
     """Event and effect of one injector. rearm: as the injector has it, None for as the effect has it;
-    max_activations: 0 for no limit.
+    max_activations: 0 for no limit; stride_ns: of the gait, 0 when not known.
     """
 
     event: EventSpec
     effect: EffectSpec
     rearm: bool | None = None
     max_activations: int = 0
+    stride_ns: int = 0
 
     def forecast(self, plan: BusPlan, cob_ids: tuple[int, ...], duration_ns: int) -> Forecast | None:
         """What its event brings in motions of that length; None when nobody can tell. cob_ids: of the target."""
@@ -65,7 +66,8 @@ class Timing:
 
     def _play(self, plan: BusPlan, rng: Generator, frame_ns: int, duration_ns: int) -> int | None:
         """The activations in one motion, up to one whose length is not known; None for an event that is not known."""
-        event, effect = self.event.stand_in(plan, rng, frame_ns), self.effect.stand_in(plan, rng, frame_ns)
+        event = self.event.stand_in(plan, rng, frame_ns, self.stride_ns)
+        effect = self.effect.stand_in(plan, rng, frame_ns)
         if event is None:
             return None
         count, time = 0, event.first()

@@ -20,7 +20,8 @@ Names: TypeAlias = Annotated[tuple[Text, ...], Field(min_length=1)]
 Way: TypeAlias = Literal["to_controller", "to_drives", "both"]
 Signal: TypeAlias = Literal["activated", "manifested", "ended"]
 
-_RISES: Final = {"activated": "is activated", "manifested": "manifests", "ended": "ends"}
+RISES: Final = {"activated": "is activated", "manifested": "manifests", "ended": "ends"}
+"""The signals of an injector, as verbs: when each rises."""
 _HOLDS: Final = {"activated": "is active", "manifested": "has manifested", "ended": "has ended"}
 
 
@@ -103,7 +104,7 @@ class TriggerSpec(SpecModel):
         if self.frame is not None:
             text = f"with {self.frame.words()}"
         else:
-            verb = (_HOLDS if self.edge == "level" else _RISES)[self.on]
+            verb = (_HOLDS if self.edge == "level" else RISES)[self.on]
             if self.all is not None and len(self.all) > 1:
                 verb = f"{'are all' if self.on == 'activated' else 'have all'} {self.on}"
             names = (" and " if self.all is not None else " or ").join(self.sources)
@@ -141,7 +142,7 @@ class ReportSpec(SpecModel):
     def words(self) -> str:
         """For people."""
         way = "both ways" if self.frame.bus == "both" else self.frame.bus
-        return f"sends 0x{self.frame.cob_id:03X}{_hex(self.frame.data or '')} {way} when it {_RISES[self.on]}"
+        return f"sends 0x{self.frame.cob_id:03X}{_hex(self.frame.data or '')} {way} when it {RISES[self.on]}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -120,7 +120,7 @@ class BitError(FrameFault):
 
     field: one of `FIELDS`; bit: its index there, from 0, stuff bits not counted; receivers: mask of those who see it
     (also the sender, if its port is in it); cob_ids, senders: of the frames it hits.
-    EN 50159: corruption, detected by the CAN controller, so it appears as a delay, or as a loss. FIBlock: none.
+    EN 50159: corruption, detected by the CAN controller, so it appears as a delay, or as a deletion. FIBlock: none.
     """
 
     def __init__(
@@ -155,7 +155,7 @@ class BitError(FrameFault):
 class StuckDominant(WireFault):
     """The bus is dominant, whoever sends what: bit' = 0. A short circuit, or a transceiver that does not let go.
 
-    EN 50159: loss (of everything). FIBlock: none.
+    EN 50159: deletion (of everything). FIBlock: none.
     """
 
     def errors(self, now: int, until: int, bit_ns: int, frame: Frame | None, sender: int) -> list[Disruption]:
@@ -180,7 +180,7 @@ class StuckDominant(WireFault):
 class NoAck(FrameFault):
     """These receivers do not acknowledge (mask, ALL: nobody does): ACK slot recessive unless another one answers.
 
-    EN 50159: none by itself; the sender repeats, and becomes error-passive. FIBlock: none.
+    EN 50159: delay; the sender repeats, and becomes error-passive. FIBlock: none.
     """
 
     def __init__(self, receivers: int = ALL, cob_ids: tuple[int, ...] = (), senders: int = ALL) -> None:

@@ -15,9 +15,10 @@ from typing import Annotated, Final, Literal
 from canopen_exo.bus.node import MS, NEVER, SECOND
 from canopen_exo.plan import BusPlan
 from fi_gateway.boundary import Later, SpecModel, Text, validate
+from fi_gateway.doubts import injector_warnings
 from fi_gateway.marked_yaml import Data, Document, apply_override, load
 from fi_gateway.quantity import format_hertz
-from fi_gateway.schema import InjectorSpec, describe_injectors, injector_warnings, status_watchers
+from fi_gateway.schema import InjectorSpec, describe_injectors, status_watchers
 from testbench.scenario import (
     Cycle,
     Name,

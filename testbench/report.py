@@ -123,12 +123,12 @@ def fault_figure(shown: Plotted) -> "Figure":
     low, high = np.degrees(limit.min_angle_rad), np.degrees(limit.max_angle_rad)
     _panel(position, "angle [deg]", (low, high))
     if said.has_reference:
-        position.plot(t_said, np.degrees(said.q_ref[rows, k]), color=_REFERENCE, lw=1.0, ls=(0, (4, 3)), zorder=4)
+        _refer(position, t_said, np.degrees(said.q_ref[rows, k]))
     _pair(position, golden, faulted, golden.q[:, k], faulted.q[:, k], 180 / np.pi)
     speed = limit.speed_rad_s * _RPM
     _panel(velocity, "speed [rpm]", (-speed, speed))
     if said.has_reference:
-        velocity.plot(t_said, said.dq_ref[rows, k] * _RPM, color=_REFERENCE, lw=1.0, ls=(0, (4, 3)), zorder=4)
+        _refer(velocity, t_said, said.dq_ref[rows, k] * _RPM)
     _pair(velocity, golden, faulted, golden.dq[:, k], faulted.dq[:, k], _RPM)
     _panel(torque, "torque [N m]", (-limit.torque_nm, limit.torque_nm))
     # an artist, not a plot: a command of thousands of N m shall not squeeze the torques that acted
@@ -145,7 +145,7 @@ def fault_figure(shown: Plotted) -> "Figure":
     position.set_title(f"RMSE against golden: {one.rmse_position_rad:.4f} rad", loc="right", fontsize=9)
     velocity.set_title(f"RMSE against golden: {one.rmse_velocity_rad_s:.3f} rad/s", loc="right", fontsize=9)
     torque.set_title(f"RMSE against golden: {one.rmse_torque_nm:.2f} N m", loc="right", fontsize=9)
-    _legend(figure, with_reference=said.has_reference, with_windows=bool(windows(shown, joint)))
+    _legend(figure, with_reference=said.has_reference, with_command=True, with_windows=bool(windows(shown, joint)))
     return figure
 
 
@@ -155,6 +155,8 @@ def joints_figure(shown: Plotted) -> "Figure":
 
     duration_s = shown.faulted.duration_s
     golden, faulted = clip(shown.golden.truth, duration_s), clip(shown.faulted.truth, duration_s)
+    said = shown.faulted.commands
+    spoken = motion_rows(said.t_s, duration_s)
     rows = (len(shown.joints) + 1) // 2
     figure = Figure(figsize=(12, 2.6 * rows + 1.2), layout="constrained")
     grid = figure.subplots(rows, 2, sharex=True, sharey="row", squeeze=False)
@@ -165,6 +167,8 @@ def joints_figure(shown: Plotted) -> "Figure":
         limit = shown.limits[joint]
         low, high = np.degrees(limit.min_angle_rad), np.degrees(limit.max_angle_rad)
         _panel(axes, "angle [deg]" if k < rows else "", (low, high))
+        if said.has_reference:
+            _refer(axes, said.t_s[spoken], np.degrees(said.q_ref[spoken, k]))
         _pair(axes, golden, faulted, golden.q[:, k], faulted.q[:, k], 180 / np.pi)
         _shade(axes, windows(shown, joint))
         axes.set_xlim(0, duration_s)
@@ -174,7 +178,7 @@ def joints_figure(shown: Plotted) -> "Figure":
     for axes in grid[-1]:
         axes.set_xlabel("time from start of motion [s]")
     _heading(figure, shown, "joint angles")
-    _legend(figure, with_reference=False, with_windows=bool(windows(shown)))
+    _legend(figure, with_reference=said.has_reference, with_command=False, with_windows=bool(windows(shown)))
     return figure
 
 
@@ -188,6 +192,10 @@ def _panel(axes: "Axes", label: str, limits: tuple[float, float]) -> None:
     axes.set_axisbelow(True)
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
+
+
+def _refer(axes: "Axes", t_s: Array, values: Array) -> None:
+    axes.plot(t_s, values, color=_REFERENCE, lw=1.0, ls=(0, (4, 3)), zorder=4)
 
 
 def _pair(axes: "Axes", golden: Truth, faulted: Truth, before: Array, after: Array, to_unit: float) -> None:
@@ -217,7 +225,8 @@ def _lanes(axes: "Axes", shown: Plotted) -> None:
                 fill = _WINDOW if one.manifested else "none"
                 span = (start / 1e9, (end - start) / 1e9)
                 axes.broken_barh([span], (lane - 0.4, 0.45), facecolor=fill, edgecolor=_WINDOW_EDGE, lw=0.9)
-        injected, manifested = sum(one.frames_injected for one in found), sum(one.manifested for one in found)
+        injected = sum(one.frames_injected + one.attempts_disturbed for one in found)
+        manifested = sum(one.manifested for one in found)
         counts = f"{len(found)} activated, {injected} injected, {manifested} manifested"
         axes.text(0.004, lane + 0.26, counts, fontsize=7, va="center", transform=axes.get_yaxis_transform())
     axes.set_yticks(range(len(names)), [textwrap.shorten(name, 18, placeholder="...") for name in names], fontsize=7)
@@ -243,7 +252,7 @@ def _heading(figure: "Figure", shown: Plotted, subject: str) -> None:
     )
 
 
-def _legend(figure: "Figure", *, with_reference: bool, with_windows: bool) -> None:
+def _legend(figure: "Figure", *, with_reference: bool, with_command: bool, with_windows: bool) -> None:
     """One legend below everything, the same entries for every panel."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
@@ -254,6 +263,7 @@ def _legend(figure: "Figure", *, with_reference: bool, with_windows: bool) -> No
     ]
     if with_reference:
         entries.append(Line2D([], [], color=_REFERENCE, lw=1.0, ls=(0, (4, 3)), label="reference"))
+    if with_command:
         entries.append(Line2D([], [], color=_COMMAND, lw=0.9, label="torque command before clamp (may leave the plot)"))
     entries.append(Line2D([], [], color=_LIMIT, lw=1.0, ls="-.", label="limit"))
     if with_windows:

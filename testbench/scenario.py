@@ -20,9 +20,10 @@ from canopen_exo.bus.node import MS, SECOND
 from canopen_exo.errors import CanopenExoError
 from canopen_exo.plan import BusPlan, JointNode
 from fi_gateway.boundary import Angle, Later, Share, Span, SpecModel, Text, Time, dump, json_schema, validate
+from fi_gateway.doubts import injector_warnings
 from fi_gateway.marked_yaml import Data, Document, apply_override, load, parse, write
 from fi_gateway.quantity import describe_value, format_duration, format_hertz, parse_hertz
-from fi_gateway.schema import InjectorSpec, check_injectors, describe_injectors, injector_warnings
+from fi_gateway.schema import InjectorSpec, check_injectors, describe_injectors
 from hlc.limits import limits_of
 from testbench.errors import BenchError
 from testbench.expect import Expectation, parse_expectation
@@ -222,7 +223,8 @@ class Scenario(SpecModel):
     @property
     def warnings(self) -> list[str]:
         """What is allowed and still looks like a mistake, such as an injector that can never act."""
-        return injector_warnings(self.injectors, self.plan, self.motion.duration_ns)
+        motion = self.motion
+        return injector_warnings(self.injectors, self.plan, motion.duration_ns, stride_ns=motion.stride_ns)
 
     def resolved_yaml(self) -> str:
         """The scenario as a file with the defaults filled in; reads as an equal scenario."""
@@ -273,7 +275,8 @@ def describe(scenario: Scenario) -> list[str]:
     stride, duration = format_duration(motion.stride_ns), format_duration(motion.duration_ns)
     lines.append(f"motion: {motion.gait}, stride {stride}, {duration} after a fade-in of one stride")
     lines.append(f"seed: {scenario.seed}")
-    lines.extend(describe_injectors(scenario.injectors, plan, motion.duration_ns) or ["no injectors: a fault-free run"])
+    told = describe_injectors(scenario.injectors, plan, motion.duration_ns, motion.stride_ns)
+    lines.extend(told or ["no injectors: a fault-free run"])
     tolerance = f" by more than {math.degrees(scenario.tolerance_rad):g} deg" if scenario.tolerance_rad else ""
     limits = " or passes a torque or speed limit" if scenario.fail_on == "error" else ""
     lines.append(f"verdict: fails if a joint leaves its range of travel{tolerance}{limits}")

@@ -8,16 +8,15 @@ from pydantic import PlainSerializer, PlainValidator, WithJsonSchema
 from canopen_exo.signal import Signal
 from fi_gateway.boundary import SpecError, SpecModel
 from fi_gateway.faults import Fault
-from fi_gateway.quantity import Dimension, QuantityError, describe_value, parse_quantity
+from fi_gateway.quantity import Dimension, QuantityError, describe_value, dimension_of, parse_quantity
 from fi_gateway.target import Place, cob_id
 
-_DIMENSIONS: Final = {"rad": Dimension.ANGLE, "rad/s": Dimension.SPEED, "N m": Dimension.TORQUE}
-_COUNTS: Final = {"rad": "counts", "rad/s": "counts/s"}
+_COUNTS: Final = {"rad": "counts", "rad/s": "counts/s", "stride": "counts"}
 _WHOLE: Final = re.compile(r"([+-]?[0-9]{1,20})\s*(counts(?:/s)?)", re.ASCII)
 _COUNTED: Final = re.compile(r"([+-]?[0-9]{1,20}(?:\.[0-9]{0,20})?)\s*(counts(?:/s)?)", re.ASCII)
 _PER_TIME: Final = re.compile(r"(.*?)\s*/\s*(s|ms|min)", re.ASCII)
 _SECONDS: Final = {"s": 1.0, "ms": 1e-3, "min": 60.0}
-_SLOPES: Final = {"rad": "1 deg/s", "rad/s": "10 rpm/s", "N m": "0.5 N m/s", "": "3 /s"}
+_SLOPES: Final = {"rad": "1 deg/s", "rad/s": "10 rpm/s", "N m": "0.5 N m/s", "stride": "10 %/s", "": "3 /s"}
 _PAYLOAD: Final = re.compile(r"[0-9a-fA-F]{2}( [0-9a-fA-F]{2}){0,7}", re.ASCII)
 _RATIO: Final = re.compile(r"([+-]?[0-9]{1,9}(?:\.[0-9]{0,20})?)\s*%", re.ASCII)
 _MOST_RATIO: Final = 1e9
@@ -87,10 +86,14 @@ class FaultSpec(SpecModel):
         """Why it changes nothing: "factor is 1"; "" when it does."""
         return ""
 
+    def needs_frames(self) -> bool:
+        """Whether it acts with frames of the target alone, and not by its own clock."""
+        return True
+
 
 def raw_value(given: str | int | float, signal: Signal, key: str = "value") -> int:
     """The raw integer of a value written for that signal, not yet checked for range; raises SpecError at `key`."""
-    dimension = _DIMENSIONS.get(signal.unit)
+    dimension = dimension_of(signal.unit)
     if dimension is None:
         if not isinstance(given, int):
             raise SpecError((key,), f"{_name(signal)} is a plain number without unit, such as 0x27; got {given!r}")
@@ -125,7 +128,7 @@ def raw_slope(given: str | int | float, signal: Signal, key: str) -> float:
     try:
         if parts is not None:
             change: str | int = parts[1]
-            if signal.unit not in _DIMENSIONS and re.fullmatch(r"[+-]?[0-9]{1,18}", parts[1], re.ASCII):
+            if dimension_of(signal.unit) is None and re.fullmatch(r"[+-]?[0-9]{1,18}", parts[1], re.ASCII):
                 change = int(parts[1])
             return _raw_float(change, signal, key) / _SECONDS[parts[2]]
     except SpecError:
@@ -135,7 +138,7 @@ def raw_slope(given: str | int | float, signal: Signal, key: str) -> float:
 
 
 def _raw_float(given: str | int | float, signal: Signal, key: str) -> float:
-    dimension = _DIMENSIONS.get(signal.unit)
+    dimension = dimension_of(signal.unit)
     if dimension is None:
         if not isinstance(given, int | float):
             raise SpecError((key,), f"{_name(signal)} is a plain number without unit, such as 3; got {given!r}")

@@ -31,6 +31,10 @@ class InsertSpec(FaultSpec):
             )
         return Insert(Frame(self._id(place), bytes.fromhex(self.payload)), self.every_ns or 0)
 
+    def needs_frames(self) -> bool:
+        """Not with `every`."""
+        return self.every_ns is None
+
     def _id(self, place: Place) -> int:
         if self.cob_id is not None:
             return self.cob_id

@@ -144,7 +144,7 @@ class BusOffSpec(WireFaultSpec):
     restart_ns: Annotated[Time | None, Field(alias="restart")] = None
 
     def build(self, place: Place) -> OnWire:
-        """See BusOff."""
+        """See SwitchedOff."""
         if not place.node or place.cob_ids:
             raise SpecError((), f"bus_off acts on a node; give node alone in the target: {' | '.join(place.nodes)}")
         return SwitchedOff(place.wire, place.nodes.index(place.node), self.restart_ns or 0)

@@ -169,7 +169,7 @@ class RelativeNoise(NoiseFault):
 class UniformNoise(NoiseFault):
     """Uniform noise: out = in + U, U uniform on [-b, b). amount: b, wire units of the signal.
 
-    EN 50159: corruption. FIBlock: Noise; there b is a share of the value.
+    EN 50159: corruption. FIBlock: none; b of its Noise is a share of the value.
     """
 
     def error(self, raw: int, rng: Generator) -> float:

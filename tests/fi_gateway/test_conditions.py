@@ -125,6 +125,31 @@ def test_commands_are_watched_on_the_controllers_side() -> None:
     assert one.watches == ((FROM_CONTROLLER, 0x201),)
 
 
+@pytest.mark.parametrize(
+    ("text", "port", "cob_id", "holding", "other"),
+    [
+        ("right_knee_EMCY.emcy_error_code != 0", FROM_DRIVES, 0x085, "3082010000000000", "0000010000000000"),
+        ("right_knee.emcy_error_register & 1 == 1", FROM_DRIVES, 0x085, "3082010000000000", "3082800000000000"),
+        ("left_hip_heartbeat.nmt_state != 5", FROM_DRIVES, 0x701, "7F", "05"),
+        ("HLC_status.phase >= 25 %", FROM_CONTROLLER, 0x2FF, "0200000040", "020000FF3F"),
+        ("HLC_status.phase < 0.25 stride", FROM_CONTROLLER, 0x2FF, "020000FF3F", "0200000040"),
+        ("HLC_status.phase == 16384 counts", FROM_CONTROLLER, 0x2FF, "0200000040", "020000FF3F"),
+        ("controller.state == 2", FROM_CONTROLLER, 0x2FF, "0200000000", "0100000000"),
+        ("HLC_heartbeat.nmt_state == 5", FROM_CONTROLLER, 0x77F, "05", "7F"),
+        ("NMT.nmt_command == 0x81", FROM_CONTROLLER, 0x000, "8100", "0100"),
+        ("SYNC.sync_counter > 239", FROM_CONTROLLER, 0x080, "F0", "01"),
+    ],
+)
+def test_every_message_of_the_dbc_can_be_in_a_condition(
+    text: str, port: int, cob_id: int, holding: str, other: str
+) -> None:
+    """Conditions over decoded signals: those of the services too, on the side from which they come."""
+    one = condition(text)
+    assert one.watches == ((port, cob_id),)
+    assert one.observe(Frame(cob_id, bytes.fromhex(holding)))
+    assert not one.observe(Frame(cob_id, bytes.fromhex(other)))
+
+
 def test_a_frame_too_short_for_a_signal_leaves_it_as_it_was() -> None:
     """Bad bytes are data."""
     one = condition("right_knee.position < 0 rad and right_knee.velocity < 0 rpm")
@@ -159,6 +184,15 @@ def test_a_copy_goes_on_alike(payloads: list[bytes]) -> None:
         ("right_knee.statusword & 8 > 8", False),
         ("right_knee.statusword < 0 or right_knee.position < 0 rad", True),
         ("right_knee.statusword < 0 and right_knee.position < 0 rad", False),
+        ("right_knee.position < -60 deg and right_knee.position > 0 deg", False),
+        ("right_knee.position < -60 deg and left_knee.position > 0 deg", True),
+        ("right_knee.position <= 5 counts and right_knee.0x6064 >= 5 counts", True),
+        ("right_knee.position < 5 counts and right_knee.position >= 5 counts", False),
+        ("right_knee.position < 5 counts or right_knee.position > 9 counts", True),
+        ("right_knee.position < 5 counts and (right_knee.position > 9 counts or right_knee.position < 3 counts)", True),
+        ("right_knee.statusword & 8 == 8 and right_knee.statusword & 8 == 0", False),
+        ("right_knee.statusword & 8 == 8 and right_knee.statusword & 4 == 0", True),
+        ("right_knee.statusword == 8 and right_knee.statusword != 7", True),
     ],
 )
 def test_what_signals_cannot_carry_can_never_hold(text: str, can_hold: bool) -> None:
@@ -205,12 +239,18 @@ def test_no_text_breaks_the_parser(text: str) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("knee.position < 3 deg", "character 1: unknown joint 'knee'"),
+        ("knee.position < 3 deg", "character 1: unknown joint or message 'knee'"),
         ("left_knee.position < 3 deg and rihgt_knee.position < 1 deg",
-         "character 32: unknown joint 'rihgt_knee'; did you mean 'right_knee'?"),
+         "character 32: unknown joint or message 'rihgt_knee'; did you mean 'right_knee'? (this rig has left_hip, "
+         "left_knee, left_ankle, right_hip, right_knee, right_ankle, controller, and the messages of the DBC, su"),
+        ("right_knee_EMYC.emcy_error_code != 0", "'right_knee_EMYC'; did you mean 'right_knee_EMCY'?"),
+        ("right_knee_SDO.index == 1", "unknown joint or message 'right_knee_SDO'"),
+        ("HLC_status.0x0000 == 1", "no signal '0x0000' of HLC_status (allowed: state, cycle, phase; what is in SDOs"),
+        ("HLC_status.phase > 0.25", "'0.25' has no unit; a gait phase needs one (units: stride, %"),
+        ("HLC_status.phase == 25 %", "HLC_status.phase is a measured value and never exactly equal"),
         ("right_knee.positon < 3 deg",
-         "no PDO carries 'positon' of right_knee; did you mean 'position'? (allowed: controlword, target_torque"),
-        ("right_knee.0x6078 < 3", "no PDO carries '0x6078' of right_knee (allowed: controlword, target_torque"),
+         "no signal 'positon' of right_knee; did you mean 'position'? (allowed: controlword, target_torque"),
+        ("right_knee.0x6078 < 3", "no signal '0x6078' of right_knee (allowed: controlword, target_torque"),
         ("right_knee.0xyz < 3", "'0xyz' is not an object such as 0x6064"),
         ("right_knee.position < 3", "'3' has no unit; an angle needs one"),
         ("right_knee.position < 3 rpm", "'3 rpm' is an angular velocity; an angle is wanted"),

@@ -23,6 +23,7 @@ PLAN: Final = BusPlan(tuple(JointNode(name, number, 54_900, 131_072) for number,
 POSITION: Final = "{bus: to_controller, node: right_knee, signal: position}"
 VELOCITY: Final = "{bus: to_controller, node: right_knee, signal: velocity}"
 TORQUE: Final = "{bus: to_controller, node: right_knee, signal: torque}"
+PHASE: Final = "{bus: to_drives, signal: HLC_status.phase}"
 WORD: Final = "{bus: to_controller, node: right_knee, signal: statusword}"
 TPDO1: Final = "{bus: to_controller, node: right_knee, pdo: TPDO1}"
 EVERY_TPDO1: Final = "{bus: to_controller, pdo: TPDO1}"
@@ -85,6 +86,55 @@ def test_a_fault_in_a_file_does_what_it_says(fault: str, target: str, now: int, 
     found = outcome(fault, target, data, now)
     assert found is not None
     assert found.data == bytes.fromhex(result)
+
+
+@pytest.mark.parametrize(
+    ("fault", "phase"),
+    [
+        ("stuck_at_value, value: 0.25 stride", 0x4000),
+        ("stuck_at_value, value: 25 %", 0x4000),
+        ("stuck_at_value, value: 16384 counts", 0x4000),
+        ("package_drop, value: 12.5%", 0x2000),
+        ("bias, value: -25 %", 0x4000),
+        ("bias, value: 0.25 stride", 0xC000),
+        ("drift, slope: 0.25 stride/s", 0xC000),
+        ("drift, slope: 0.025 %/ms", 0xC000),
+        ("drift, slope: 2.5 counts/s", 0x8003),
+    ],
+)
+def test_the_gait_phase_is_written_in_strides_or_per_cent(fault: str, phase: int) -> None:
+    """HLC_status.phase, u16 of 1/65536 stride, behind state and cycle; half a stride came in, 1 s after the start."""
+    result = begun(f"{{type: {fault}}}", PHASE).apply(SECOND, Frame(0x2FF, bytes.fromhex("0200000080")), Taken())
+    assert result is not None
+    assert result.data == bytes.fromhex("020000") + phase.to_bytes(2, "little")
+
+
+@pytest.mark.parametrize(("amount", "most"), [("1 %", 655), ("0.01 stride", 655), ("655 counts", 655)])
+def test_noise_of_the_gait_phase_has_its_amount_in_strides(amount: str, most: int) -> None:
+    """Uniform: up to that amount, rounded."""
+    fault = begun(f"{{type: noise, uniform: {amount}}}", PHASE)
+    results = [fault.apply(0, Frame(0x2FF, bytes.fromhex("0200000080")), Taken()) for _ in range(2000)]
+    errors = [abs(int.from_bytes(one.data[3:], "little") - 0x8000) for one in results if one is not None]
+    assert 0.98 * most < max(errors) <= most
+
+
+@pytest.mark.parametrize(
+    ("fault", "message"),
+    [
+        ("stuck_at_value, value: 0.25", "0.25 has no unit; a gait phase needs one (units: stride, %; for example"),
+        ("stuck_at_value, value: 3", "3 has no unit"),
+        ("stuck_at_value, value: 100 %", "100 % is more than phase of controller can carry; allowed 0..0.999985 str"),
+        ("stuck_at_value, value: 5 deg", "'5 deg' is an angle; a gait phase is wanted"),
+        ("drift, slope: 3 /s", "phase of controller changes in stride per time, such as '10 %/s'; got '3 /s'"),
+        ("noise, normal: 1", "1 has no unit"),
+    ],
+)
+def test_a_plain_number_is_no_gait_phase(fault: str, message: str) -> None:
+    """3 could be strides, per cent or counts."""
+    with pytest.raises(FileErrors) as caught:
+        spec(f"{{type: {fault}}}", PHASE)
+    (said,) = caught.value.messages
+    assert message in said
 
 
 @pytest.mark.parametrize(

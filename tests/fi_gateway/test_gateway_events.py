@@ -112,6 +112,23 @@ def test_a_condition_looks_at_frames_as_they_came_in() -> None:
     assert met(gateway(f"{{type: when, {BELOW}}}", "{type: frames, n: 1}", front), [5, 5, -1, 5]) == [2]
 
 
+def test_a_condition_may_be_over_the_frames_of_services() -> None:
+    """The EMCY of a drive, from its side alone; state and phase of the controller's status frame."""
+    emcy, gone = Frame(0x085, bytes.fromhex("3082010000000000")), Frame(0x085, bytes(8))
+    event, until = (f"condition: right_knee_EMCY.emcy_error_code {sign} 0" for sign in ("!=", "=="))
+    node, changed = gateway(f"{{type: when, {event}}}", f"{{type: until, {until}}}"), []
+    sent = {2: (CONTROLLER_PORT, emcy), 4: (DRIVE_PORT, emcy), 7: (CONTROLLER_PORT, gone), 9: (DRIVE_PORT, gone)}
+    for number in range(12):
+        if cycle_of(node, number):
+            changed.append(number)
+        if number in sent:
+            pass_on(node, (1000 + number) * CYCLE + 900_000, *sent[number])
+    assert changed == [5, 6, 7, 8, 9]
+    quarter = "HLC_status.state == 2 and HLC_status.phase >= 15 % and HLC_status.phase < 0.35 stride"
+    found = met(gateway(f"{{type: when, condition: {quarter}, edge: level}}", "{type: frames, n: 1}"), [0] * 130)
+    assert found == [20, 30, 120]
+
+
 def test_every_nth_frame_is_met_from_time_0_on() -> None:
     """every {n} frames: the n-th itself is met; frames before time 0 do not count."""
     assert met(gateway("{type: every, n: 3}", "{type: frames, n: 1}"), [0] * 10) == [2, 5, 8]

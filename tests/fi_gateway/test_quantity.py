@@ -41,6 +41,8 @@ from fi_gateway.quantity import (
         (" +.5 ms ", Dimension.TIME, 0.0005),
         ("0.5 kHz", Dimension.FREQUENCY, 500.0),
         ("2 min", Dimension.TIME, 120.0),
+        ("0.25 stride", Dimension.PHASE, 0.25),
+        ("-25 %", Dimension.PHASE, -0.25),
     ],
 )
 def test_a_quantity_is_its_si_value(text: str, dimension: Dimension, value: float) -> None:
@@ -63,6 +65,8 @@ def test_a_bare_number_is_refused_with_the_units_allowed(given: object, dimensio
         ("5 parsec", "unknown unit 'parsec'"),
         ("5 S", "unknown unit 'S'"),
         ("5 deg", "is an angle; a duration is wanted"),
+        ("5 stride", "is a gait phase; a duration is wanted"),
+        ("5 %", "unknown unit '%'"),
         ("nan s", "is not a duration"),
         ("inf s", "is not a duration"),
         (".inf s", "is not a duration"),

@@ -106,6 +106,27 @@ def test_rearm_and_max_activations_override_the_effect() -> None:
     assert found.activations == 35
 
 
+@pytest.mark.parametrize(
+    ("phase", "effect", "activations"),
+    [
+        ("0", "{type: frames, n: 1}", 5),  # at 0, 1.5, 3, 4.5 and 6 s
+        ("66 %", "{type: frames, n: 1}", 5),  # at 0.99 .. 6.99 s
+        ("67 %", "{type: frames, n: 1}", 4),  # at 1.004, then up to 5.504 s
+        ("66 %", "{type: constant_time, duration: 1.5 s}", 5),
+        ("66 %", "{type: constant_time, duration: 1.51 s}", 3),
+        ("99.99 %", "{type: frames, n: 1}", 5),  # the nearest control cycle is the first of the next stride
+        ("30 %", "{type: once}", 1),
+    ],
+)
+def test_a_phase_of_the_gait_comes_once_a_stride(phase: str, effect: str, activations: int) -> None:
+    """From time 0 on, which is phase 0, with a stride of 1.5 s; not known without one."""
+    event = f"{{type: gait_phase, phase: {phase}}}"
+    found = timing(event, effect, stride_ns=3 * SECOND // 2).forecast(PLAN, SAMPLES, MOTION)
+    assert found is not None
+    assert found.activations == activations
+    assert timing(event, effect).forecast(PLAN, SAMPLES, MOTION) is None
+
+
 def test_a_very_high_rate_is_reckoned_on() -> None:
     """Not played to its end: as it began."""
     found = timing("{type: rate, lambda: 1e6 1/s}", "{type: constant_time, duration: 1 us}").forecast(
@@ -215,5 +236,5 @@ def test_editors_are_told_of_every_event_and_effect() -> None:
 def test_a_condition_that_does_not_fit_the_rig_stops_the_building() -> None:
     """What was never checked is refused."""
     spec = injector("{type: when, condition: neck.position < 1 deg}")
-    with pytest.raises(FaultError, match="unknown joint 'neck'"):
+    with pytest.raises(FaultError, match="unknown joint or message 'neck'"):
         spec.timing().warnings(resolve(spec.target, PLAN), PLAN, MOTION)

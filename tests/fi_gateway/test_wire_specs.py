@@ -101,6 +101,15 @@ def test_what_cannot_be_is_refused_with_the_remedy(fault: str, target: str, mess
     assert message in str(found.value)
 
 
+@pytest.mark.parametrize("fault", ["bus_off, restrt: 1 s", "no_ack, receivers: 5", "bit_error, field: tail"])
+def test_a_wire_fault_with_a_wrong_key_is_told_of_that_key_alone(fault: str) -> None:
+    """Its target needs no direction of travel: the type says that it is a wire fault, whatever else is wrong."""
+    with pytest.raises(FileErrors) as found:
+        spec(f"{{type: {fault}}}", "{node: right_knee}")
+    (message,) = found.value.messages
+    assert "a.fault." in message
+
+
 def test_events_that_count_frames_need_frames_in_the_target() -> None:
     """A bus as a whole has none that pass the gateway; a wire fault has no payload to repair."""
     more = "event: {type: every, n: 5}, effect: {type: once}"

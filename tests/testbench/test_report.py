@@ -109,6 +109,16 @@ def test_every_injector_has_a_lane_with_its_windows_and_counts(failed: Plotted) 
     assert lane_bars(lanes) == [(3.0, 3.3, True), (5.0, 5.3, True), (3.1, 3.4, True)]
 
 
+def test_attempts_that_a_wire_fault_disturbed_are_counted_as_in_the_document(
+    run_maker: RunMaker, activation_maker: ActivationMaker
+) -> None:
+    """Injected and manifested: attempts to send are what it acts on."""
+    one = activation_maker(signal="right_knee.TPDO1@drive")
+    one.frames_injected, one.frames_changed, one.attempts_disturbed = 0, 0, 12
+    lanes = fault_figure(shown(run_maker(), run_maker(activations=[one]))).axes[3]
+    assert [text.get_text() for text in lanes.texts] == ["1 activated, 12 injected, 12 manifested"]
+
+
 def test_window_that_changed_nothing_is_hollow(run_maker: RunMaker, activation_maker: ActivationMaker) -> None:
     """Activated is not manifested."""
     one = activation_maker()
@@ -143,6 +153,30 @@ def test_each_joint_has_its_panel_one_side_a_column(failed: Plotted) -> None:
     """Six joints, left and right side by side."""
     titles = [axes.get_title(loc="left") for axes in joints_figure(failed).axes]
     assert titles == ["left hip", "right hip", "left knee", "right knee", "left ankle", "right ankle"]
+
+
+def test_every_joint_shows_reference_golden_and_faulted_run(failed: Plotted) -> None:
+    """All six joints: what was wanted, what came without and with faults; the legend says which is which."""
+    said, runs = failed.faulted.commands, (failed.golden.truth, failed.faulted.truth)
+    figure = joints_figure(failed)
+    panels = {axes.get_title(loc="left").replace(" ", "_"): axes for axes in figure.axes}
+    for k, joint in enumerate(SIX):
+        drawn = [np.asarray(line.get_ydata()) for line in panels[joint].lines]
+        for expected in (np.degrees(said.q_ref[:, k]), *(np.degrees(truth.q[:, k]) for truth in runs)):
+            assert any(one.shape == expected.shape and np.allclose(one, expected) for one in drawn)
+    (legend,) = figure.legends
+    labels = [text.get_text() for text in legend.get_texts()]
+    assert labels == ["golden run", "faulted run", "reference", "limit", "fault active"]
+
+
+def test_what_a_foreign_controller_wanted_is_not_shown(failed: Plotted) -> None:
+    """It says its commands on the bus, and no reference."""
+    nothing = np.zeros((failed.faulted.commands.t_s.size, 0))
+    said = replace(failed.faulted.commands, q_ref=nothing, dq_ref=nothing)
+    view = replace(failed, faulted=replace(failed.faulted, commands=said))
+    for figure, more in ((joints_figure(view), []), (fault_figure(view), ["torque command before clamp"])):
+        labels = [text.get_text().partition(" (")[0] for text in figure.legends[0].get_texts()]
+        assert labels == ["golden run", "faulted run", *more, "limit", "fault active"]
 
 
 def test_windows_of_one_joint_are_joined_where_they_overlap(failed: Plotted) -> None:
