@@ -100,6 +100,27 @@ def test_installed_program_shows_its_help(installed: Path, tmp_path: Path) -> No
     assert "run" in done.stdout
 
 
+@pytest.mark.run
+def test_installed_program_runs_a_scenario(installed: Path, tmp_path: Path) -> None:
+    """Gait, models, EDS and DBC come from the wheel, and no module from the checkout."""
+    shutil.copy(ROOT / "scenarios" / "knee_freeze_at.yaml", tmp_path)
+    code = (
+        "import sys\n"
+        "from testbench.cli import main\n"
+        "sys.argv = ['exo-hil', 'run', 'knee_freeze_at.yaml', '--set', 'motion.duration=0.5s', '--out', 'result']\n"
+        "code = main()\n"
+        f"ours = [module for name, module in sys.modules.items() if name.split('.')[0] in {PACKAGES}]\n"
+        "print(*[module.__file__ for module in ours], sep='\\n')\n"
+        "sys.exit(code)\n"
+    )
+    done = outside(tmp_path, "-P", "-c", code, path=installed)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert (tmp_path / "result" / "summary.json").exists()
+    places = [line for line in done.stdout.splitlines() if line.endswith(".py")]
+    assert len(places) > 50
+    assert all(Path(place).is_relative_to(installed) for place in places)
+
+
 def test_help_imports_no_heavy_package(tmp_path: Path) -> None:
     """Lazy imports: after --help, sys.modules has no numpy, mujoco, pydantic, can."""
     code = (
