@@ -88,8 +88,8 @@ class Channel:
 class RecordChannel(Channel):
     """A channel whose base data frames (11-bit id, 0..8 bytes) can go, as the bytes that came, to another one.
 
-    Of the last `read` - count: what it found; ids, stamps: of each, when it found nothing but base data frames. The
-    stamps never go back.
+    Of the last `read` - count: what it found; ids, and after `stamp` stamps: of each, when it found nothing but base
+    data frames. The stamps never go back.
     """
 
     def __init__(self, name: str) -> None:
@@ -100,6 +100,10 @@ class RecordChannel(Channel):
 
     def read(self) -> bool:
         """As `receive`, but keep what came until the next call; False when it is not base data frames alone."""
+        raise NotImplementedError
+
+    def stamp(self) -> None:
+        """Work out `stamps`, once after a `read` that gave True: it takes about as long as passing frames on."""
         raise NotImplementedError
 
     def arrival(self, number: int) -> Arrival:

@@ -47,20 +47,21 @@ class Lateness:
             octave = delay_ns.bit_length() - 4
             self._bins[(octave << 3) + (delay_ns >> octave)] += 1
         else:
-            self._bins[_bin(delay_ns if delay_ns > 0 else 0)] += 1
+            self._bins[_bin(delay_ns)] += 1
 
     def add_since(self, times: list[int], now: int) -> None:
         """Count the delays of these times, in ascending order, until `now`."""
         left = len(times)
-        if left < _FEW:
-            for time_ns in times:
-                self.add(now - time_ns)
-            return
         self.count += left
-        if now - times[0] > self.worst_ns:
+        if left and now - times[0] > self.worst_ns:
             self.worst_ns = now - times[0]
+        if left < _FEW:
+            bins = self._bins
+            for time_ns in times:
+                bins[_bin(now - time_ns)] += 1
+            return
         while left:  # bin by bin, from the shortest
-            index = _bin(max(now - times[left - 1], 0))
+            index = _bin(now - times[left - 1])
             first = bisect_right(times, now - _lower(index + 1), 0, left)
             self._bins[index] += left - first
             left = first
@@ -125,10 +126,12 @@ class Lateness:
 
 
 def _bin(value: int) -> int:
-    """0..15 have a bin each; from there eight bins to the octave."""
+    """0..15 have a bin each; from there eight bins to the octave; what is negative counts as 0."""
+    if value < 16:
+        return value if value > 0 else 0
     if value > _TOP_NS:
         value = _TOP_NS
-    octave = max(value.bit_length() - 4, 0)
+    octave = value.bit_length() - 4
     return (octave << 3) + (value >> octave)
 
 

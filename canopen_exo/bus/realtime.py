@@ -296,8 +296,7 @@ class RealTimeLoop:
         found = [channel for channel in channels if isinstance(channel, RecordChannel)]
         if len(found) < 2 or type(found[0]) is not type(found[1]):
             return None
-        clock = self.now if measure else None
-        return ShortCut(node, found, self._lines, self._out, self._deliver, clock)
+        return ShortCut(node, found, self._lines, self._out, self._deliver, self.now, measure)
 
     def _deliver(self, line: Line, arrival: Arrival, latest: int) -> None:
         """Give one arrival to the node. latest: no stamp counts as later than this, the time at which all had come."""

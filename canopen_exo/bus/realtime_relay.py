@@ -19,13 +19,16 @@ from canopen_exo.bus.realtime_out import Line, RealTimeOut
 _PLACES: Final = (0, 1)
 _NOTHING: Final[list[list[Arrival]]] = []
 
+_NEAR_NS: Final = 200_000
+"""A stamp may be off by what it takes to compare two clocks (`StampClock`): some microseconds."""
+
 Deliver = Callable[[Line, Arrival, int], None]
 """Gives an arrival to the node; no stamp counts as later than the time given."""
 
 
 @final
 class ShortCut:
-    """Serves what comes on two channels. deliver: the loop's; clock: loop time, of sending, for the line's latency."""
+    """Serves what comes on two channels. deliver: the loop's; clock: loop time; measure: keep the lines' latency."""
 
     def __init__(
         self,
@@ -34,7 +37,8 @@ class ShortCut:
         lines: list[Line],
         out: RealTimeOut,
         deliver: Deliver,
-        clock: Callable[[], int] | None,
+        clock: Callable[[], int],
+        measure: bool,
     ) -> None:
         self._relay: Final[Relay] = relay
         self._channels: Final[list[RecordChannel]] = channels
@@ -43,6 +47,8 @@ class ShortCut:
         self._out: Final[RealTimeOut] = out
         self._deliver: Final = deliver
         self._clock: Final = clock
+        self._measure: Final[bool] = measure
+        self._passed: Final[list[tuple[int, int, int, int]]] = []  # place, first, end, and when: not accounted for yet
         self._at: Final[list[int]] = [0, 0]  # by place: how many of those that came have been served
         self._ends: Final[list[int]] = [0, 0]
 
@@ -51,57 +57,60 @@ class ShortCut:
         at, ends = self._at, self._ends
         at[0] = at[1] = 0
         is_plain = True
+        plain: list[RecordChannel] = []
         for place, line, channel in self._ways:
+            ends[place] = 0
             if line.fd in readable or channel.poll_at <= now:
-                if not channel.read():
-                    is_plain = False
+                is_base = channel.read()
                 ends[place] = channel.count
-            else:
-                ends[place] = 0
+                if not is_base:
+                    is_plain = False
+                elif channel.count:
+                    plain.append(channel)
+        if is_plain and len(plain) == 1:
+            self._lead(0 if ends[0] else 1)
+        latest = -NEVER
+        for channel in plain:
+            channel.stamp()
+            latest = max(latest, channel.stamps[-1])
         if is_plain:
-            if ends[0] + ends[1] == 1:
-                self._serve_one(ends[1])
-                return _NOTHING
-            self._serve_runs()
+            if at != ends:
+                self._serve_runs(latest)
+            self._account()
             if at == ends:
+                self._out.served_ns = max(self._out.served_ns, latest)
                 return _NOTHING
         left: list[list[Arrival]] = []
         for place in _PLACES:
             left.append([self._channels[place].arrival(number) for number in range(at[place], ends[place])])
         return left
 
-    def _serve_one(self, place: int) -> None:
-        """A base data frame alone, which is what a bus that is not crowded gives."""
-        relay, source, line = self._relay, self._channels[place], self._lines[1 - place]
-        stamp = source.stamps[0]
-        if (
-            relay.filters[place][source.ids[0]] == PASS_ON
-            and relay.wake_at >= stamp
-            and not line.waiting
-            and self._channels[1 - place].send_run(source, 0, 1)
-        ):
-            relay.frames[place] += 1
-            if stamp > self._out.served_ns:
-                self._out.served_ns = stamp
-            if self._clock is not None:
-                line.latency.add(self._clock() - stamp)
-        else:
-            self._deliver(self._lines[place], source.arrival(0), stamp)
+    def _lead(self, place: int) -> None:
+        """Send what only passes, up to the first other frame, before anything else is done with what came here alone.
 
-    def _serve_runs(self) -> None:
-        """Base data frames alone, until all are served or something is in the way."""
+        Without stamps: no wake-up is near enough to be due among these frames.
+        """
+        relay = self._relay
+        table = relay.filters[place]
+        limit = 0
+        for one in self._channels[place].ids:
+            if table[one] != PASS_ON:
+                break
+            limit += 1
+        if limit and not self._lines[1 - place].waiting and relay.wake_at > self._clock() + _NEAR_NS:
+            self._pass_on(place, limit)
+
+    def _serve_runs(self, latest: int) -> None:
+        """Base data frames alone, until all are served or something is in the way. latest: of their stamps."""
         at, ends = self._at, self._ends
         filters = [bytearray(one) for one in self._relay.filters]
-        latest = -NEVER
         stops: list[tuple[int, int, int]] = []  # stamp, place and number of those that do not only pass
         for place, _, channel in self._ways:
-            if ends[place]:
-                table, stamps = filters[place], channel.stamps
-                if stamps[-1] > latest:
-                    latest = stamps[-1]
-                stops += [
-                    (stamps[number], place, number) for number, one in enumerate(channel.ids) if table[one] != PASS_ON
-                ]
+            if at[place] < ends[place]:
+                table, ids, stamps = filters[place], channel.ids, channel.stamps
+                for number in range(at[place], ends[place]):
+                    if table[ids[number]] != PASS_ON:
+                        stops.append((stamps[number], place, number))
         if ends[0] and ends[1]:
             stops.sort()
         for stamp, place, number in stops:
@@ -112,8 +121,6 @@ class ShortCut:
         for place in _PLACES:
             if at[place] < ends[place] and not (self._is_free(latest, filters) and self._pass_on(place, ends[place])):
                 return
-        if latest > self._out.served_ns:
-            self._out.served_ns = latest
 
     def _is_free(self, latest: int, filters: list[bytearray]) -> bool:
         """Whether nothing is in the way of frames up to the stamp `latest`, and what passes is what passed before."""
@@ -129,6 +136,12 @@ class ShortCut:
         end = start + self._channels[1 - place].send_run(source, start, limit)
         self._at[place] = end
         self._relay.frames[place] += end - start
-        if self._clock is not None:
-            self._lines[1 - place].latency.add_since(source.stamps[start:end], self._clock())
+        if self._measure:
+            self._passed.append((place, start, end, self._clock()))
         return end == limit
+
+    def _account(self) -> None:
+        """Note how long what has passed was under way; no frame waits for this."""
+        for place, start, end, now in self._passed:
+            self._lines[1 - place].latency.add_since(self._channels[place].stamps[start:end], now)
+        self._passed.clear()

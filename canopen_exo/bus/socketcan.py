@@ -201,7 +201,8 @@ class SocketCanChannel(RecordChannel):
 
     def receive(self) -> list[Arrival]:
         """What the kernel holds, at most 64 frames at once (the rest stays readable); opens again what was away."""
-        self.read()
+        if self.read():
+            self.stamp()
         return [self.arrival(number) for number in range(self.count)]
 
     def read(self) -> bool:
@@ -221,10 +222,10 @@ class SocketCanChannel(RecordChannel):
                 pass
             except OSError as error:
                 failure = error
-        now = self._stamps.begin(self.epoch_ns)  # not before reading: no stamp is later than now
         if count and receiver.is_plain and not self._is_down and not self._notices and self._take_base(count):
             self.count = count
             return True
+        now = self._stamps.begin(self.epoch_ns)  # not before reading: no stamp is later than now
         if count:
             self._take_all(now)
         elif failure is not None:
@@ -235,6 +236,18 @@ class SocketCanChannel(RecordChannel):
             self.poll_at = NEVER
         self.count = len(self._found)
         return self.count == 0
+
+    def stamp(self) -> None:
+        """The kernel's stamps on the loop's clock."""
+        if self.count == 0:
+            return
+        receiver = self._receiver
+        self._stamps.begin(self.epoch_ns)
+        if self.count == 1:  # a frame alone, what a bus that is not crowded gives
+            _, _, seconds, nanos = receiver.first()
+            self.stamps = [self._stamps.at(seconds * SECOND + nanos)]
+        else:
+            self.stamps = self._stamps.many(receiver.seconds(), receiver.nanos())
 
     def arrival(self, number: int) -> Arrival:
         """One of those that `read` kept."""
@@ -310,18 +323,16 @@ class SocketCanChannel(RecordChannel):
     def _take_base(self, count: int) -> bool:
         """Plain records that are base data frames, as nearly all are; False for any other."""
         receiver = self._receiver
-        if count == 1:  # a frame alone, what a bus that is not crowded gives, waits for this
-            can_id, length, seconds, nanos = receiver.first()
+        if count == 1:
+            can_id, length, _, _ = receiver.first()
             if can_id > 0x7FF or length > 8:
                 return False
             self.ids = [can_id]
-            self.stamps = [self._stamps.at(seconds * SECOND + nanos)]
             return True
         ids = receiver.ids()
         if max(ids) > 0x7FF or receiver.longest() > 8:
             return False
         self.ids = ids
-        self.stamps = self._stamps.many(receiver.seconds(), receiver.nanos())
         return True
 
     def _take_all(self, now: int) -> None:

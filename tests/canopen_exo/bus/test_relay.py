@@ -44,6 +44,9 @@ class FakeRecordChannel(RecordChannel):
         self.stamps = [arrival.stamp_ns for arrival in self.found]
         return len(self.ids) == self.count
 
+    def stamp(self) -> None:
+        pass
+
     def arrival(self, number: int) -> Arrival:
         return self.found[number]
 
