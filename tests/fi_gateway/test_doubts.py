@@ -5,7 +5,7 @@ from typing import Final
 import pytest
 
 from fi_gateway.doubts import injector_warnings
-from tests.fi_gateway.test_schema import PLAN, SECOND, TPDO1, injector, read
+from tests.fi_gateway.injector_texts import PLAN, SECOND, TPDO1, injector, read
 
 
 @pytest.mark.parametrize(

@@ -1,157 +1,22 @@
 """Frames that go on later, in addition or not at all: order, counts and copies, through receive() and wake()."""
 
-import copy
 import pickle
-from typing import final
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from numpy.random import Generator
 
 from canopen_exo.bus.frame import FLAG_EXTENDED, Frame
-from canopen_exo.bus.node import MS, NEVER, Out
+from canopen_exo.bus.node import NEVER
 from canopen_exo.signal import Signal
 from fi_gateway.effects import ConstantTime, Infinite
 from fi_gateway.errors import FaultError
 from fi_gateway.events import At, Never
-from fi_gateway.faults import Bias, Drop, Fault, StuckAtPayload
-from fi_gateway.gateway import CONTROLLER_PORT, DRIVE_PORT, Gateway
+from fi_gateway.faults import Bias, Drop, Fault
+from fi_gateway.gateway import CONTROLLER_PORT, DRIVE_PORT
 from fi_gateway.injector import Injector, Target, stream
 from fi_gateway.outlet import Outlet
 from fi_gateway.repair import Repair
 from fi_gateway.trigger import Trigger
-
-COUNT = Signal("count", "left_hip", "left_hip_TPDO1", 0x181, 0, 8, False, 1.0, "", 0x2000, 0)
-
-
-class Sink(Out):
-    """Keeps what is sent, with the time of the call."""
-
-    def __init__(self) -> None:
-        self.now = 0
-        self.sent: list[tuple[int, int, Frame]] = []
-
-    def send(self, port: int, frame: Frame) -> None:
-        self.sent.append((self.now, port, frame))
-
-
-class Slow(Fault):
-    """Every frame later by a time that its first byte gives [10 ns]; 0: goes on at once."""
-
-    def __init__(self, in_order: bool, step: int = 10) -> None:
-        super().__init__()
-        self.in_order = in_order
-        self.step = step
-
-    def apply(self, now: int, frame: Frame, outlet: Outlet) -> Frame | None:
-        wait = self.step * frame.data[0] if frame.data else 0
-        if wait == 0:
-            return frame
-        outlet.later(now + wait, frame, self.in_order)
-        return None
-
-    def __reduce__(self) -> tuple[type["Slow"], tuple[bool, int]]:
-        return Slow, (self.in_order, self.step)
-
-
-class Twice(Fault):
-    """Each frame, and before it a further one; after `later` ns (0 for none) a third."""
-
-    def __init__(self, later: int = 0, can_id: int = -1) -> None:
-        super().__init__()
-        self.later = later
-        self.can_id = can_id
-
-    def apply(self, now: int, frame: Frame, outlet: Outlet) -> Frame | None:
-        outlet.insert(Frame(self.can_id if self.can_id >= 0 else frame.can_id, frame.data))
-        if self.later:
-            outlet.later(now + self.later, frame, False)
-        return frame
-
-    def __reduce__(self) -> tuple[type["Twice"], tuple[int, int]]:
-        return Twice, (self.later, self.can_id)
-
-
-class Rename(Fault):
-    """Another COB-ID, or an extended one."""
-
-    def __init__(self, can_id: int, flags: int = 0) -> None:
-        super().__init__()
-        self.can_id = can_id
-        self.flags = flags
-
-    def apply(self, now: int, frame: Frame, outlet: Outlet) -> Frame | None:
-        return Frame(self.can_id, frame.data, self.flags)
-
-    def __reduce__(self) -> tuple[type["Rename"], tuple[int, int]]:
-        return Rename, (self.can_id, self.flags)
-
-
-class Beat(Fault):
-    """Inserts a frame every `period` ns while active, from the start on."""
-
-    def __init__(self, period: int, can_id: int = 0x181) -> None:
-        super().__init__()
-        self.period = period
-        self.can_id = can_id
-
-    def begin(self, now: int, held: dict[int, Frame], rng: Generator) -> bool:
-        self.wake_at = now
-        return True
-
-    def apply(self, now: int, frame: Frame, outlet: Outlet) -> Frame | None:
-        return frame
-
-    def wake(self, now: int, outlet: Outlet) -> None:
-        self.wake_at = now + self.period
-        outlet.insert(Frame(self.can_id, b"\xbe"))
-
-    def __reduce__(self) -> tuple[type["Beat"], tuple[int, int], dict[str, object]]:
-        return Beat, (self.period, self.can_id), {"wake_at": self.wake_at}
-
-
-class Stuck(Beat):
-    """Does not move on."""
-
-    def wake(self, now: int, outlet: Outlet) -> None:
-        self.wake_at = now
-
-
-def always(fault: Fault, name: str = "x", ids: tuple[int, ...] = (0x181,), both: bool = False) -> Injector:
-    """Active from power-up on."""
-    target = Target(True, both, ids)
-    return Injector(name, target, fault, At((0,)), Infinite(), None, stream(1, 0, name), True, True)
-
-
-@final
-class Bench:
-    """A gateway and what has come out, served as a loop does."""
-
-    def __init__(self, *injectors: Injector) -> None:
-        self.gateway = Gateway(list(injectors), 2 * MS)
-        self.sink = Sink()
-
-    def until(self, now: int) -> None:
-        """Serve all wake-ups up to and including `now`."""
-        while self.gateway.wake_at <= now:
-            self.sink.now = self.gateway.wake_at
-            self.gateway.wake(self.gateway.wake_at, self.sink)
-            assert self.gateway.wake_at > self.sink.now
-
-    def give(self, now: int, frame: Frame, port: int = DRIVE_PORT) -> None:
-        """A frame ends at `now`."""
-        self.until(now - 1)
-        self.sink.now = now
-        self.gateway.receive(now, port, frame, self.sink)
-
-    def came(self) -> list[tuple[int, bytes]]:
-        """Time and payload of all that has come out to the controller."""
-        return [(at, frame.data) for at, port, frame in self.sink.sent if port == CONTROLLER_PORT]
-
-
-def tpdo(*data: int) -> Frame:
-    return Frame(0x181, bytes(data))
+from tests.fi_gateway.passage_faults import COUNT, Beat, Bench, Rename, Slow, Stuck, Twice, always, tpdo
 
 
 def test_a_late_frame_goes_on_at_its_time() -> None:
@@ -334,114 +199,6 @@ def test_a_repair_covers_late_and_inserted_frames() -> None:
     assert bench.came() == [(100, b"\x11\x11"), (110, b"\x22\x22"), (120, b"\x05\x09")]
 
 
-# ---- properties ---------------------------------------------------------------------------------------------------
-
-TRAFFIC = st.lists(
-    st.tuples(
-        st.integers(0, 60),
-        st.sampled_from([CONTROLLER_PORT, DRIVE_PORT]),
-        st.sampled_from([0x080, 0x181, 0x182, 0x183]),
-        st.binary(max_size=3),
-    ),
-    max_size=40,
-)
-
-
-def faults_of(kinds: list[int]) -> list[Injector]:
-    """Injectors of some kinds, on 0x181 and 0x182, with windows here and there."""
-    made: list[Injector] = []
-    for number, kind in enumerate(kinds):
-        drop, stuck = Drop(0.5), StuckAtPayload(b"\x07")
-        choice = (Slow(True), Slow(False), Twice(25), Twice(0, 0x182), Rename(0x182), drop, Beat(70), stuck)
-        target = Target(True, number % 2 == 0, (0x181, 0x182))
-        event, rng = At(tuple(range(100 * number, 3000, 700))), stream(1, 0, f"{number}")
-        made.append(Injector(f"{number}", target, choice[kind], event, ConstantTime(400), None, rng, True, True))
-    return made
-
-
-def served(bench: Bench, traffic: list[tuple[int, int, int, bytes]], start: int = 0) -> None:
-    now = start
-    for gap, port, can_id, data in traffic:
-        now += gap
-        bench.give(now, Frame(can_id, data), port)
-
-
-@pytest.mark.long
-@settings(deadline=None)
-@given(TRAFFIC, st.lists(st.integers(0, 7), max_size=5))
-def test_no_frame_gets_lost_or_made_without_being_counted(
-    traffic: list[tuple[int, int, int, bytes]], kinds: list[int]
-) -> None:
-    """Frames in + inserted = frames out + lost + waiting; at the end nothing waits."""
-    bench = Bench(*faults_of(kinds))
-    served(bench, traffic)
-    gateway = bench.gateway
-    for _ in range(2):
-        total = sum(gateway.frames) + sum(gateway.inserted)
-        assert total == len(bench.sink.sent) + sum(gateway.lost) + gateway.waiting
-        bench.until(20_000)
-    assert gateway.waiting == 0
-    for one in gateway.injectors:
-        assert not one.lines
-        records = [record for record in gateway.records if record.injector == one.name]
-        assert one.manifested == sum(record.manifested for record in records)
-        assert one.injected == sum(record.frames_injected for record in records)
-
-
-@pytest.mark.long
-@settings(deadline=None)
-@given(TRAFFIC, st.lists(st.integers(0, 7), max_size=5))
-def test_frames_that_are_no_target_pass_at_once_in_order(
-    traffic: list[tuple[int, int, int, bytes]], kinds: list[int]
-) -> None:
-    """The identical frames, at the same instant, whatever happens to the others."""
-    bench = Bench(*faults_of(kinds))
-    served(bench, traffic)
-    now, given_frames = 0, []
-    for gap, port, can_id, data in traffic:
-        now += gap
-        if can_id not in (0x181, 0x182):
-            given_frames.append((now, 1 - port, Frame(can_id, data)))
-    assert [row for row in bench.sink.sent if row[2].can_id not in (0x181, 0x182)] == given_frames
-
-
-@pytest.mark.long
-@settings(deadline=None)
-@given(TRAFFIC, st.lists(st.integers(0, 7), min_size=1, max_size=5))
-def test_after_the_windows_nothing_is_left(traffic: list[tuple[int, int, int, bytes]], kinds: list[int]) -> None:
-    """Activation and deactivation leave no residue: later frames pass as through an empty gateway."""
-    bench = Bench(*faults_of(kinds))
-    served(bench, traffic)
-    bench.until(20_000)
-    bench.sink.sent.clear()
-    served(bench, traffic, 30_000)
-    bench.until(60_000)
-    plain = Bench()
-    served(plain, traffic, 30_000)
-    assert bench.sink.sent == plain.sink.sent
-
-
-@pytest.mark.long
-@settings(deadline=None)
-@given(TRAFFIC, st.lists(st.integers(0, 7), max_size=4), st.integers(0, 40))
-def test_a_copy_in_mid_run_goes_on_as_the_original(
-    traffic: list[tuple[int, int, int, bytes]], kinds: list[int], cut: int
-) -> None:
-    """Snapshots: frames that wait, lines and windows are copied."""
-    bench = Bench(*faults_of(kinds))
-    served(bench, traffic[:cut])
-    start = sum(gap for gap, _, _, _ in traffic[:cut])
-    twins = [bench, copy.copy(bench)]
-    twins[1].gateway = copy.deepcopy(bench.gateway)
-    for twin in twins:
-        twin.sink = Sink()
-        served(twin, traffic[cut:], start)
-        twin.until(20_000)
-    assert twins[0].sink.sent == twins[1].sink.sent
-    counts = [[(one.activated, one.injected, one.manifested) for one in twin.gateway.injectors] for twin in twins]
-    assert counts[0] == counts[1]
-
-
 def test_a_gateway_with_frames_that_wait_can_be_pickled() -> None:
     """As copies are; Drop is of the package, so that its class is found again."""
     bench = Bench(always(Slow(True)))
@@ -450,23 +207,6 @@ def test_a_gateway_with_frames_that_wait_can_be_pickled() -> None:
     twin.gateway = pickle.loads(pickle.dumps(bench.gateway))
     twin.until(1000)
     assert twin.came() == [(190, b"\x09")]
-
-
-@pytest.mark.long
-@settings(deadline=None)
-@given(TRAFFIC, st.permutations([0, 1, 2]))
-def test_the_order_of_independent_injectors_does_not_matter(
-    traffic: list[tuple[int, int, int, bytes]], order: list[int]
-) -> None:
-    """One stream per injector: on frames of their own, each draws the same whoever is written first."""
-
-    def run(numbers: list[int]) -> list[tuple[int, int, Frame]]:
-        names = ("a", "b", "c")
-        bench = Bench(*(always(Drop(0.5), names[number], (0x181 + number,)) for number in numbers))
-        served(bench, traffic)
-        return bench.sink.sent
-
-    assert run(order) == run([0, 1, 2])
 
 
 def test_a_trigger_starts_what_waits_behind_a_late_frame_when_it_manifests() -> None:

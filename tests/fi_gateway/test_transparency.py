@@ -1,6 +1,6 @@
 """The gateway on real interfaces: real sockets with the kernel's CAN records on them, served by the real-time loop.
 
-The records are made here by hand from linux/can.h, byte for byte, and compared byte for byte: nothing of our codec is
+The records are made by hand from linux/can.h, byte for byte, and compared byte for byte: nothing of our codec is
 in the comparison. Socket pairs take the place of AF_CAN, which is tried out in tests/vcan. Every test runs on both ways
 through the loop: every frame made and handled (with a trace), and what only passes sent on as the record that came.
 """
@@ -10,146 +10,33 @@ import random
 import select
 import socket
 import struct
-import subprocess
-import sys
-import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
-from pathlib import Path
-from typing import Final
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import pytest
 
 from canopen_exo.bus import recvmmsg
-from canopen_exo.bus.frame import Frame
-from canopen_exo.bus.hub import HubServer, listen
-from canopen_exo.bus.hub_client import HubChannel
 from canopen_exo.bus.losses import Losses
-from canopen_exo.bus.node import NEVER, SECOND, ErrorState
+from canopen_exo.bus.node import NEVER, ErrorState
 from canopen_exo.bus.realtime import RealTimeLoop
 from canopen_exo.bus.socketcan import SocketCanChannel
 from fi_gateway.control import statistics
-from fi_gateway.effects import Infinite
-from fi_gateway.events import At
 from fi_gateway.faults import BitFlip, Drop
-from fi_gateway.gateway import CONTROLLER_PORT, DRIVE_PORT, Gateway
-from fi_gateway.injector import Injector, Target, stream
-
-ROOT: Final = Path(__file__).resolve().parents[2]
-
-EXTENDED, REMOTE, ERROR = 0x80000000, 0x40000000, 0x20000000
-FDF, BRS, ESI = 4, 1, 2
-FD_LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
-PATIENCE_NS = 20 * SECOND
-"""A busy machine; only a gateway that loses a frame makes a test wait this long."""
-
-
-def classical(can_id: int, data: bytes = b"", raw_dlc: int = 0, length: int | None = None) -> bytes:
-    """struct can_frame: id, len, pad, reserved, len8_dlc, 8 data bytes."""
-    return struct.pack("=IBBBB8s", can_id, len(data) if length is None else length, 0, 0, raw_dlc, data)
-
-
-def fd(can_id: int, data: bytes, flags: int) -> bytes:
-    """struct canfd_frame: id, len, flags, 2 reserved, 64 data bytes; FDF as kernels set it on what they receive."""
-    return struct.pack("=IBBBB64s", can_id, len(data), flags | FDF, 0, 0, data)
-
-
-def kinds() -> list[bytes]:
-    """Every kind of frame there is, each with its own content."""
-    numbers = (0, 1, 0x80, 0x185, 0x2FF, 0x6C0, 0x7FF)
-    data = bytes(range(0xA1, 0xA1 + 64))
-    found = [classical(number, data[:length]) for number in numbers for length in range(9)]
-    found += [classical(number, data[:8], raw) for number in numbers for raw in range(9, 16)]
-    found += [classical(number | REMOTE, length=length) for number in numbers for length in range(9)]
-    found += [classical(number | REMOTE, raw_dlc=raw, length=8) for number in numbers for raw in range(9, 16)]
-    for number in (0, 0x185, 0x7FF, 0x800, 0x1FFFFFFF):
-        found += [classical(number | EXTENDED, data[:length]) for length in range(9)]
-        found += [classical(number | EXTENDED, data[:8], 15), classical(number | EXTENDED | REMOTE, length=3)]
-    for number in (0, 0x185, 0x7FF, 0x185 | EXTENDED, 0x1FFFFFFF | EXTENDED):
-        for flags in (0, BRS, ESI, BRS | ESI):
-            found += [fd(number, data[:length], flags) for length in FD_LENGTHS]
-    return found
-
-
-def injector(name: str, cob_id: int, fault: Drop | BitFlip) -> Injector:
-    return Injector(
-        name, Target(True, True, (cob_id,)), fault, At((0,)), Infinite(), None, stream(1, 0, name), True, True
-    )
-
-
-Pair = tuple[socket.socket, socket.socket]
-
-
-def unix_pair() -> Pair:
-    """Without the kernel's stamps."""
-    return socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
-
-
-def udp_pair() -> Pair:
-    """With the kernel's stamps, as SocketCAN has them."""
-    ends = socket.socket(socket.AF_INET, socket.SOCK_DGRAM), socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    for end in ends:
-        end.bind(("127.0.0.1", 0))
-    for end, other in zip(ends, reversed(ends), strict=True):
-        end.connect(other.getsockname())
-    return ends
-
-
-class Bench:
-    """A gateway between two interfaces, and the far ends of both. far[p]: what is connected to the gateway's port p."""
-
-    def __init__(self, injectors: list[Injector], record: bool, pair: Callable[[], Pair]) -> None:
-        self.gateway = Gateway(injectors, 2_000_000)
-        self.record = record
-        self.far: list[socket.socket] = []
-        self.channels: list[SocketCanChannel] = []
-        self.came: list[list[bytes]] = [[], []]
-        for name in ("controller", "drive"):
-            near, far = pair()
-            far.setblocking(False)
-            self.far.append(far)
-            self.channels.append(SocketCanChannel(f"socketcan:{name}", near.dup))
-            near.close()
-        self.loop = RealTimeLoop(
-            self.gateway, list(self.channels), [0, 1], time.monotonic_ns(), record=record, measure_latency=True
-        )
-
-    def pass_all(self, given: list[list[bytes]], expected: list[int]) -> None:
-        """Offer four records of each side a turn, until the expected numbers have come out, then a few turns more."""
-        at, turns = [0, 0], 0
-
-        def feed(now: int) -> bool:
-            nonlocal turns
-            for port in (0, 1):
-                for record in given[port][at[port] : at[port] + 4]:
-                    self.far[port].send(record)
-                at[port] += 4
-                self._drain(port)
-            if all(at[port] >= len(given[port]) and len(self.came[port]) >= expected[port] for port in (0, 1)):
-                turns += 1
-            return now > limit or turns > 3
-
-        limit = self.loop.now() + PATIENCE_NS
-        self.loop.run(feed)
-
-    def _drain(self, port: int) -> None:
-        try:
-            while True:
-                self.came[port].append(self.far[port].recv(72))
-        except BlockingIOError:
-            pass
-
-    def close(self) -> None:
-        for channel in self.channels:
-            channel.close()
-        for far in self.far:
-            far.close()
-
-
-MakeBench = Callable[..., AbstractContextManager[Bench]]
-
-WAYS: Final = {"frames": (True, unix_pair), "records": (False, unix_pair), "stamped-records": (False, udp_pair)}
+from fi_gateway.gateway import CONTROLLER_PORT, DRIVE_PORT
+from fi_gateway.injector import Injector
+from tests.fi_gateway.socket_bench import (
+    ERROR,
+    PATIENCE_NS,
+    WAYS,
+    Bench,
+    MakeBench,
+    classical,
+    injector,
+    kinds,
+    udp_pair,
+    unix_pair,
+)
 
 
 @pytest.fixture(params=WAYS)
@@ -390,121 +277,3 @@ def test_no_frame_is_lost_doubled_or_moved_in_a_long_stream(bench: MakeBench) ->
         assert made.came[DRIVE_PORT] == given[CONTROLLER_PORT]
         assert made.came[CONTROLLER_PORT] == given[DRIVE_PORT]
         assert (made.loop.losses(), made.gateway.lost, made.gateway.undelivered) == (0, [0, 0], [0, 0])
-
-
-# ---- the soak recipe ----------------------------------------------------------------------------------------------
-
-
-@pytest.mark.long
-def test_the_soak_recipe_runs() -> None:
-    """`make soak` in small: a gateway in a process of its own, 50 000 frames, every record compared with its due."""
-    command = [sys.executable, "-m", "benchmarks.soak", "--frames", "50000", "--seconds", "0"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
-    assert done.returncode == 0, done.stderr
-    assert "50000 frames" in done.stdout
-    assert "5000 frames over busy buses" in done.stdout
-
-
-@pytest.mark.parametrize("towards_controller", [False, True])
-@pytest.mark.parametrize(
-    ("change", "complaint"),
-    [
-        (lambda records: records[:5] + records[6:], "1 frames lost or overtaken"),
-        (lambda records: [*records[:6], records[5], *records[6:]], "doubled or changed"),
-        (lambda records: [*records[:5], records[6], records[5], *records[7:]], "lost or overtaken"),
-        (lambda records: [*records[:5], records[5][:-1] + b"x", *records[6:]], "doubled or changed"),
-    ],
-)
-def test_the_soak_recipe_sees_what_it_is_there_for(
-    monkeypatch: pytest.MonkeyPatch,
-    change: Callable[[list[bytes]], list[bytes]],
-    complaint: str,
-    towards_controller: bool,
-) -> None:
-    """Lost, doubled, out of order, changed: each ends the run with the number of the frame."""
-    monkeypatch.syspath_prepend(str(ROOT))
-    from benchmarks.soak import Stream
-
-    pairs = [socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM) for _ in range(2)]
-    for pair in pairs:
-        for end in pair:
-            end.setblocking(False)
-    stream = Stream(pairs[0][0], pairs[1][1], towards_controller, 20)
-    for _ in range(20):
-        stream.send()
-    records = [pairs[0][1].recv(72) for _ in range(20)]
-    for record in change(records):
-        pairs[1][0].send(record)
-    with pytest.raises(SystemExit, match=complaint):
-        stream.receive()
-    for pair in pairs:
-        for end in pair:
-            end.close()
-
-
-# ---- no reflection, on a bus with others on it --------------------------------------------------------------------
-
-
-@contextmanager
-def hub() -> Iterator[str]:
-    """A fast hub in a thread; its address."""
-    server = HubServer(listen("127.0.0.1", 0), 0)
-    stop, stopper = socket.socketpair()
-
-    def serve() -> None:
-        while server.serve(stop):
-            pass
-
-    thread = threading.Thread(target=serve)
-    thread.start()
-    try:
-        yield server.address()
-    finally:
-        stopper.send(b"x")
-        thread.join()
-        server.close()
-        stop.close()
-        stopper.close()
-
-
-def collect(channel: HubChannel, into: list[Frame]) -> None:
-    into.extend(arrival.frame for arrival in channel.receive() if arrival.frame is not None)
-
-
-def test_own_traffic_is_never_forwarded_again() -> None:
-    """No reflection loop: on two buses with others on them, every frame appears once on each bus, then there is peace.
-
-    Each side has a sender and a listener; the listener on the sender's own bus hears it once as well.
-    """
-    frames = [[Frame(0x200 + number, bytes((port, number))) for number in range(50)] for port in (0, 1)]
-    with hub() as address:
-        names = [f"{address}/{name}" for name in ("controller", "drive")]
-        gateway = Gateway([], 2_000_000)
-        near, senders, listeners = ([HubChannel(name) for name in names] for _ in range(3))
-        for channel in (*near, *senders, *listeners):
-            channel.open()
-        loop = RealTimeLoop(gateway, list(near), [0, 1], time.monotonic_ns())
-        heard: list[list[Frame]] = [[], []]
-        echoed: list[list[Frame]] = [[], []]
-        for port in (0, 1):
-            for frame in frames[port]:
-                assert senders[port].send(frame)
-
-        def gather(done: Callable[[], bool], limit: int) -> None:
-            def look(now: int) -> bool:
-                for port in (0, 1):
-                    collect(listeners[port], heard[port])
-                    collect(senders[port], echoed[port])
-                return now > limit or done()
-
-            loop.run(look)
-
-        gather(lambda: all(len(one) >= 100 for one in heard), loop.now() + PATIENCE_NS)
-        gather(lambda: False, loop.now() + SECOND // 5)  # a loop would go on for ever
-        for port in (0, 1):
-            assert [frame for frame in heard[port] if frame.data[0] == port] == frames[port]
-            assert [frame for frame in heard[port] if frame.data[0] != port] == frames[1 - port]
-            assert echoed[port] == frames[1 - port]
-        assert gateway.frames == [50, 50]
-        for channel in (*near, *senders, *listeners):
-            channel.close()

@@ -1,4 +1,4 @@
-"""The whole rig: a fault-free walk inside every limit, cut cables, lost samples, a restarting drive, copies."""
+"""The whole rig: a fault-free walk inside every limit, pins, lost samples, other bus plans, copies."""
 
 import copy
 import dataclasses
@@ -7,9 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from canopen_exo.bus.frame import Frame
-from canopen_exo.bus.medium import Medium, Transmission
-from canopen_exo.bus.node import MS, NEVER, SECOND, Node, Out
+from canopen_exo.bus.node import MS, SECOND
 from canopen_exo.master import POWER_UP_NS
 from canopen_exo.nmt import NmtState
 from canopen_exo.plan import (
@@ -23,94 +21,34 @@ from canopen_exo.plan import (
     BusPlan,
     Pdo,
 )
-from canopen_exo.signal import Signal
 from fi_gateway.effects import ConstantTime
-from fi_gateway.events import At, FailureProbability
-from fi_gateway.faults import Drop, Fault, StuckAt
+from fi_gateway.events import FailureProbability
+from fi_gateway.faults import Drop, StuckAt
 from fi_gateway.injector import Injector, Target, stream
 from hlc.limits import limits_of
 from hlc.node import Phase
-from joint_emulators.plant import Plant
-from testbench.record import RunRecord
 from testbench.rig import CONTROLLER_BUS, DRIVE_BUS, Rig, RigParams, build_rig
-from testbench.run import NotStartedError, drive_through, record_of, run_rig
 from testbench.scenario import default_joints
-from testbench.verdict import judge
-
-pytestmark = pytest.mark.run
-
-PLAN = BusPlan(default_joints())
-NAMES = tuple(joint.name for joint in PLAN.joints)
-CYCLE = 2 * MS
-STRIDE = 1500 * MS
-DURATION = 7 * SECOND
-RIGHT_KNEE = NAMES.index("right_knee")
-KNEE_POSITION: Signal = next(
-    signal for signal in PLAN.signals() if (signal.node, signal.name) == ("right_knee", "position")
+from tests.testbench.whole_rig import (
+    CYCLE,
+    DURATION,
+    KNEE_POSITION,
+    NAMES,
+    PLAN,
+    RIGHT_KNEE,
+    STRIDE,
+    SWITCH_ON_DISABLED,
+    bus_of,
+    finished,
+    injector,
+    new_rig,
+    run_to,
+    statuswords,
+    torques,
+    trace,
 )
 
-SYNC_LOST, RPDO_LATE, HEARTBEAT_LOST = 0x8700, 0x8250, 0x8130
-STATUSWORD_KEY, ERROR_CODE_KEY = 0x6041 << 8, 0x603F << 8
-SWITCH_ON_DISABLED = 0x0250
-"""Statusword: Switch on disabled, voltage present, remote."""
-
-Row = tuple[int, int, int, int, int, bytes]
-
-
-def new_rig(injectors: list[Injector] | None = None, *, stops: bool = False, duration_ns: int = DURATION) -> Rig:
-    return build_rig(RigParams(PLAN, stops, STRIDE, duration_ns), injectors if injectors is not None else [])
-
-
-def run_to(rig: Rig, phase: Phase, limit: int = 12 * SECOND) -> Rig:
-    """Run, cycle by cycle, until the controller is in that phase."""
-    while rig.controller.phase is not phase:
-        assert rig.loop.now < limit, f"still {rig.controller.phase.value} at {limit / 1e9:g} s"
-        rig.loop.run_until(rig.loop.now + CYCLE)
-    return rig
-
-
-def finished(rig: Rig) -> Rig:
-    """Run to the end, and 50 ms on."""
-    run_to(rig, Phase.STOPPED)
-    rig.loop.run_until(rig.loop.now + 50 * MS)
-    return rig
-
-
-def injector(fault: Fault, at_ns: int, duration_ns: int, cob_id: int) -> Injector:
-    """From the drives to the controller, at a time of the motion."""
-    target = Target(True, False, (cob_id,))
-    return Injector("x", target, fault, At((at_ns,)), ConstantTime(duration_ns), None, stream(1, 0, "x"), True, False)
-
-
-def dropped(
-    cob_id: int,
-    at_ns: int,
-    duration_ns: int,
-    *,
-    to_drives: bool = True,
-    name: str = "drop",
-    from_power_up: bool = False,
-) -> Injector:
-    """Loses every frame of an id in one direction for a time."""
-    target = Target(not to_drives, to_drives, (cob_id,), "SYNC 0x080" if cob_id == 0x080 else "")
-    effect = ConstantTime(duration_ns)
-    return Injector(name, target, Drop(), At((at_ns,)), effect, None, stream(1, 0, name), True, from_power_up)
-
-
-def trace(rows: list[Transmission]) -> list[Row]:
-    return [(row.end_ns, row.bus, row.sender, row.frame.can_id, row.frame.flags, row.frame.data) for row in rows]
-
-
-def statuswords(rig: Rig) -> list[int]:
-    return [device.od.values[STATUSWORD_KEY] for device in rig.rack.devices]
-
-
-def error_codes(rig: Rig) -> list[int]:
-    return [device.od.values[ERROR_CODE_KEY] for device in rig.rack.devices]
-
-
-def torques(rig: Rig) -> list[float]:
-    return [drive.torque_nm for drive in rig.rack.drives]
+pytestmark = pytest.mark.run
 
 
 @pytest.fixture(scope="module")
@@ -271,335 +209,6 @@ def test_lost_samples_are_waited_for_held_and_counted() -> None:
         arrivals = [row.end_ns - begin for row in commands if row.bus == DRIVE_BUS]
         assert len(arrivals) == 6
         assert max(arrivals) <= 1_920_000
-
-
-# ---- cut cables ---------------------------------------------------------------------------------------------------
-
-
-def bus_of(rig: Rig, bus: int) -> Medium:
-    return rig.drive_bus if bus == DRIVE_BUS else rig.controller_bus
-
-
-def cut_after_3_s(bus: int) -> tuple[Rig, int]:
-    """A rig in motion whose cable breaks 3 s after time 0; it, and when."""
-    rig = run_to(new_rig(), Phase.MOTION)
-    cut = rig.controller.time_zero + 3 * SECOND
-    rig.loop.run_until(cut)
-    bus_of(rig, bus).cut()
-    return rig, cut
-
-
-def last_arrivals(rig: Rig, *can_ids: int) -> list[int]:
-    """When each of these last came over the drive bus."""
-    found = dict.fromkeys(can_ids, 0)
-    for row in rig.loop.trace:
-        if row.bus == DRIVE_BUS and row.frame.can_id in found:
-            found[row.frame.can_id] = row.end_ns
-    return list(found.values())
-
-
-@pytest.mark.parametrize("bus", [CONTROLLER_BUS, DRIVE_BUS], ids=["controller", "drive"])
-def test_cut_bus_stops_drives_then_controller_and_nothing_hangs(bus: int) -> None:
-    """SYNC loss after 10 ms, RPDO deadline after 20 ms, heartbeats after 300 ms on both sides; then the run ends."""
-    rig, cut = cut_after_3_s(bus)
-    driving = torques(rig)
-    assert max(abs(nm) for nm in driving) > 1
-
-    (sync,) = last_arrivals(rig, 0x080)  # the drives have heard this one, and no other will come
-    rig.loop.run_until(sync + 5 * CYCLE - 1)
-    assert torques(rig) == driving  # held until the loss is certain
-    rig.loop.run_until(sync + 5 * CYCLE)
-    assert torques(rig) == [0.0] * 6
-    assert statuswords(rig) == [SWITCH_ON_DISABLED] * 6
-    assert error_codes(rig) == [SYNC_LOST] * 6
-    assert sync + 5 * CYCLE <= cut + 10 * MS
-
-    commands = last_arrivals(rig, *range(0x201, 0x207))
-    rig.loop.run_until(max(commands) + 20 * MS)
-    assert error_codes(rig) == [RPDO_LATE] * 6
-
-    heard = min(last_arrivals(rig, *range(0x701, 0x707)))
-    rig.loop.run_until(cut + 300 * MS)
-    assert error_codes(rig) == [HEARTBEAT_LOST] * 6
-    lost = [event for event in rig.controller.events if event.kind == "heartbeat_lost"]
-    assert sorted(event.joint for event in lost) == sorted(NAMES)
-    assert lost[0].time_ns - heard <= 300 * MS + CYCLE  # the last hop to the controller
-    assert all(cut < event.time_ns <= cut + 300 * MS for event in lost)
-    assert rig.controller.phase is Phase.STOPPING
-    assert [device.emcy.register for device in rig.rack.devices] == [0x11] * 6
-    for device in rig.rack.devices:  # newest first
-        assert device.emcy.history == [HEARTBEAT_LOST, RPDO_LATE, SYNC_LOST]
-
-    run_to(rig, Phase.STOPPED, cut + 600 * MS)
-    assert not rig.controller.completed
-    assert [event.kind for event in rig.controller.events[6:]] == ["still_enabled"] * 6  # nobody could tell it
-
-
-@pytest.mark.parametrize("bus", [CONTROLLER_BUS, DRIVE_BUS], ids=["controller", "drive"])
-def test_plant_falls_on_as_bare_physics_says_when_the_bus_is_cut(bus: int) -> None:
-    """Physics does not hang on SYNC: with the drives disabled the legs swing freely, step by step as a plant alone."""
-    rig, cut = cut_after_3_s(bus)
-    rig.loop.run_until(cut + 20 * MS)
-    alone: Plant = copy.deepcopy(rig.rack.plant)
-    rows = len(rig.rack.truth)
-    rig.loop.run_until(cut + 2 * SECOND)
-    fall = rig.rack.truth[rows:]
-    assert len(fall) == 1980
-    for row in fall:
-        alone.step([0.0] * 6)
-        assert row.q == alone.q
-    assert max(abs(q - start) for q, start in zip(fall[-1].q, fall[0].q, strict=True)) > 0.5  # rad: legs do swing
-
-
-@pytest.mark.parametrize("bus", [CONTROLLER_BUS, DRIVE_BUS], ids=["controller", "drive"])
-def test_mended_bus_brings_the_errors_but_no_torque(bus: int) -> None:
-    """The queues empty themselves, EMCYs of every drive among them; stale commands do not move a disabled drive."""
-    rig, cut = cut_after_3_s(bus)
-    rig.loop.run_until(cut + SECOND)
-    mended = rig.loop.now
-    before = len(rig.loop.trace)
-    bus_of(rig, bus).mend()
-    for _ in range(500):
-        rig.loop.run_until(rig.loop.now + MS)
-        assert torques(rig) == [0.0] * 6
-    rows = [row for row in rig.loop.trace[before:] if row.bus == CONTROLLER_BUS]
-    for node in range(1, 7):
-        codes = [row.frame.data[0] | row.frame.data[1] << 8 for row in rows if row.frame.can_id == 0x080 + node]
-        assert codes[:3] == [SYNC_LOST, RPDO_LATE, HEARTBEAT_LOST]
-    noted = {event.joint for event in rig.controller.events if event.kind == "emcy" and event.time_ns > mended}
-    assert noted == set(NAMES)
-    tail = {row.frame.can_id for row in rig.loop.trace if row.end_ns > mended + 200 * MS}
-    assert tail == {0x77F, *range(0x701, 0x707)}  # heartbeats again, and nothing else
-    assert [len(medium.waiting) for medium in rig.loop.media] == [0, 0]
-
-
-def test_bus_mended_within_the_drives_patience_goes_on() -> None:
-    """4 ms of cut, less than 5 SYNC periods: held commands, late values, no error, the motion is completed."""
-    rig = run_to(new_rig(duration_ns=SECOND), Phase.MOTION)
-    rig.loop.run_until(rig.controller.time_zero + 500 * MS)
-    rig.drive_bus.cut()
-    rig.loop.run_until(rig.loop.now + 2 * CYCLE)
-    rig.drive_bus.mend()
-    finished(rig)
-    assert rig.controller.completed
-    assert rig.controller.events == []
-    assert all(1 <= late <= 3 for late in rig.controller.late)
-
-
-# ---- a drive restarts ---------------------------------------------------------------------------------------------
-
-
-class Saboteur(Node):
-    """Sends one frame at one time."""
-
-    def __init__(self, at_ns: int, frame: Frame) -> None:
-        super().__init__()
-        self.wake_at = at_ns
-        self.frame = frame
-
-    def wake(self, now: int, out: Out) -> None:
-        out.send(0, self.frame)
-        self.wake_at = NEVER
-
-
-@pytest.mark.parametrize(
-    ("frame", "kind", "within_ns"),
-    [
-        (Frame(0x000, b"\x81\x05"), "reboot", 10 * MS),  # reset node: boot-up 5 ms later
-        (Frame(0x000, b"\x82\x05"), "reboot", 10 * MS),  # reset communication
-        (Frame(0x205, b"\x00\x00\x00\x00"), "drive_stopped", 30 * MS),  # another master disables it: TPDO2 tells
-    ],
-)
-def test_one_drive_out_of_service_ends_the_motion_for_all(frame: Frame, kind: str, within_ns: int) -> None:
-    """Stop rule: the controller notices by itself, and disables the other five."""
-    rig = new_rig(duration_ns=2 * SECOND)
-    saboteur = Saboteur(2700 * MS + 1_950_000, frame)  # after the cycle's own RPDO
-    rig.loop.connect(saboteur, [rig.drive_bus])
-    run_to(rig, Phase.MOTION)
-    rig.loop.run_until(2700 * MS)
-    assert not rig.controller.events
-    finished(rig)
-    event = rig.controller.events[0]
-    assert (event.joint, event.kind) == ("right_knee", kind)
-    assert 0 < event.time_ns - 2700 * MS <= within_ns
-    assert not rig.controller.completed
-    assert torques(rig) == [0.0] * 6
-    assert all(word & 0x6F == 0x40 for word in statuswords(rig))
-
-
-@pytest.mark.parametrize(("command", "state"), [(0x80, 127), (0x02, 4)])
-def test_drive_put_out_of_operational_ends_the_motion(command: int, state: int) -> None:
-    """Stop rule: that drive has left Operation enabled (6007) and cannot say so by PDO; its heartbeat says 7F, or 4."""
-    rig = new_rig(duration_ns=SECOND)
-    rig.loop.connect(Saboteur(2000 * MS + 1_950_000, Frame(0x000, bytes((command, 5)))), [rig.drive_bus])
-    run_to(rig, Phase.MOTION)
-    rig.loop.run_until(2000 * MS + 150 * MS)  # a heartbeat period, and the way to the controller
-    assert torques(rig)[RIGHT_KNEE] == 0.0
-    assert rig.controller.phase is not Phase.MOTION
-    (event,) = rig.controller.events
-    assert (event.joint, event.kind) == ("right_knee", "nmt_state")
-    assert f"NMT state {state}" in event.text
-    finished(rig)
-    assert not rig.controller.completed
-    assert torques(rig) == [0.0] * 6
-
-
-# ---- supervision that a fault takes away --------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("cob_id", "code", "joints", "after_ns", "within_ns"),
-    [
-        (0x080, SYNC_LOST, NAMES, 8 * MS, 10 * MS),  # 5 periods from the last SYNC heard, up to one before the drop
-        (0x205, RPDO_LATE, ("right_knee",), 18 * MS, 20 * MS),  # 20 ms from the last command heard
-        (0x77F, HEARTBEAT_LOST, NAMES, 200 * MS, 300 * MS),  # 300 ms from the last heartbeat heard
-    ],
-)
-def test_drive_that_loses_its_master_ends_the_motion_by_its_emcy(
-    cob_id: int, code: int, joints: tuple[str, ...], after_ns: int, within_ns: int
-) -> None:
-    """6007 = 2: the drives disable, their EMCY reaches the controller within its two hops, and all six are disabled."""
-    rig = new_rig([dropped(cob_id, SECOND, SECOND)], duration_ns=2 * SECOND)
-    run_to(rig, Phase.STOPPING)
-    drop = rig.controller.time_zero + SECOND
-    first = rig.controller.events[0]
-    assert (first.joint, first.kind) == (joints[0], "emcy")
-    assert f"{code:04X}" in first.text
-    hops = 6 * 135_000 * 2  # six drives tell it at once, each over two buses; 135 us is the longest frame
-    assert drop + after_ns <= first.time_ns <= drop + within_ns + 2 * 135_000 + hops
-    finished(rig)
-    rig.loop.run_until(rig.loop.now + 100 * MS)  # a heartbeat period
-    assert {event.joint for event in rig.controller.events if f"{code:04X}" in event.text} == set(joints)
-    assert not rig.controller.completed
-    assert torques(rig) == [0.0] * 6
-    assert all(word & 0x6F == 0x40 for word in statuswords(rig))
-    assert error_codes(rig) == [0] * 6  # the injection ended with the motion: SYNC, commands, heartbeats came again
-    after = [row for row in rig.loop.trace if row.end_ns > first.time_ns + CYCLE and 0x201 <= row.frame.can_id <= 0x206]
-    assert after
-    assert {row.frame.data for row in after} == {b"\x00\x00\x00\x00"}  # disable voltage, no torque
-
-
-@pytest.mark.parametrize(("lost", "completed"), [(3, True), (5, False)])
-def test_drives_are_patient_for_five_sync_periods(lost: int, completed: bool) -> None:
-    """Three SYNCs lost for all: held for 8 ms, the motion goes on; five: 12 ms between two SYNCs, it ends."""
-    rig = finished(new_rig([dropped(0x080, 500 * MS, lost * CYCLE)], duration_ns=SECOND))
-    assert rig.controller.completed is completed
-    assert ([event.kind for event in rig.controller.events] == []) is completed
-    (record,) = rig.gateway.records
-    assert record.frames_injected == lost
-
-
-def test_drive_that_never_beats_is_missed_before_the_motion() -> None:
-    """Every heartbeat of one drive is lost on its way but the boot-up message: 300 ms after the start command."""
-    silence = dropped(0x705, 60 * MS, 10 * SECOND, to_drives=False, from_power_up=True)
-    rig = new_rig([silence])
-    run_to(rig, Phase.STOPPED)
-    (start,) = [
-        row.end_ns - row.frame.bits * 1000
-        for row in rig.loop.trace
-        if row.bus == CONTROLLER_BUS and row.frame.data == b"\x01\x00" and row.frame.can_id == 0
-    ]
-    event = rig.controller.events[0]
-    assert (event.joint, event.kind) == ("right_knee", "heartbeat_lost")
-    assert start - 135_000 + 300 * MS <= event.time_ns <= start + 300 * MS
-    assert not rig.controller.completed
-    assert torques(rig) == [0.0] * 6
-    with pytest.raises(NotStartedError, match="faulted run: the motion never began: right_knee: heartbeat lost"):
-        record_of(rig)
-
-
-# ---- what is recorded and judged ----------------------------------------------------------------------------------
-
-PINNED = RigParams(PLAN, True, STRIDE, DURATION)
-LIMITS = {name: limits_of(name) for name in NAMES}
-SOFT_PINS = math.radians(3.0)
-"""How far limp legs sink into the pins: soft contacts yield."""
-
-
-@pytest.fixture(scope="module")
-def pinned_golden() -> RunRecord:
-    """The fault-free run with pins. Not to be changed."""
-    return run_rig(PINNED, [])[0]
-
-
-def test_sync_lost_for_good_is_detected_and_leaves_the_legs_in_their_range(pinned_golden: RunRecord) -> None:
-    """From 1 s on no SYNC reaches the drives: valid, ended early, no failure within the give of the pins."""
-    faulted, _ = run_rig(PINNED, [dropped(0x080, SECOND, 60 * SECOND)])
-    found = judge(NAMES, LIMITS, pinned_golden, faulted, tolerance_rad=SOFT_PINS)
-    assert (found.outcome, found.passed, found.failures) == ("detected_safe", True, ())
-    assert (faulted.valid, faulted.completed) == (True, False)
-    (loss,) = faulted.activations
-    assert loss.signal == "SYNC 0x080"
-    assert loss.start_ns == faulted.time0_ns + SECOND
-    assert loss.frames_seen == loss.frames_injected == loss.frames_lost == 5  # then the drives knew, and all ended
-    told = [note for note in faulted.notes if "8700" in note.text]
-    assert sorted(note.node for note in told) == sorted(NAMES)
-    assert all(1.0 < note.time_s < 1.012 for note in told)
-    last = faulted.commands.t_s[-1]
-    assert 1.0 < last < 1.012  # the controller wanted nothing after that
-
-
-def test_limp_legs_that_leave_their_range_are_a_failure_all_the_same(pinned_golden: RunRecord) -> None:
-    """Detected is not safe by itself: without pins the legs swing past their range after the motion has ended."""
-    faulted, _ = run_rig(RigParams(PLAN, False, STRIDE, DURATION), [dropped(0x080, SECOND, 60 * SECOND)])
-    found = judge(NAMES, LIMITS, pinned_golden, faulted, tolerance_rad=SOFT_PINS)
-    assert (found.outcome, found.passed, faulted.completed) == ("failure", False, False)
-    assert all(one.time_s > 1.012 for one in found.failures)
-
-
-@pytest.mark.parametrize("bus", [CONTROLLER_BUS, DRIVE_BUS], ids=["controller", "drive"])
-def test_run_whose_cable_is_cut_is_valid_and_says_what_happened(pinned_golden: RunRecord, bus: int) -> None:
-    """Full transmit queues are explained by the cut: the record can be judged, and names every drive that was lost."""
-    rig = run_to(build_rig(PINNED, []), Phase.MOTION)
-    rig.loop.run_until(rig.controller.time_zero + 3 * SECOND)
-    bus_of(rig, bus).cut()
-    drive_through(rig, lambda share: None)
-    assert rig.loop.now > rig.controller.time_zero + DURATION
-    faulted = record_of(rig)
-    assert (faulted.valid, faulted.invalid_reasons, faulted.completed) == (True, [], False)
-    assert faulted.buses[bus].queue_overflows > 0
-    lost = [note for note in faulted.notes if note.kind == "heartbeat_lost"]
-    assert sorted(note.node for note in lost) == sorted(NAMES)
-    assert all(3.0 < note.time_s <= 3.3 for note in lost)
-    assert [note.node for note in faulted.notes if note.kind == "still_enabled"] == list(NAMES)  # nobody could tell
-    assert faulted.truth.t_s[-1] == 7.0  # the plant is watched to the end of the motion time
-    assert 3.0 < faulted.commands.t_s[-1] < 3.3
-    found = judge(NAMES, LIMITS, pinned_golden, faulted, tolerance_rad=SOFT_PINS)
-    assert (found.outcome, found.passed) == ("detected_safe", True)
-    strict = judge(NAMES, LIMITS, pinned_golden, faulted)
-    assert strict.outcome == "failure"  # limp feet lean on their pins
-    assert min(one.time_s for one in strict.failures) > 3.0
-
-
-def test_same_loss_of_frames_without_a_cut_is_invalid() -> None:
-    """A queue that overflows for no reason proves nothing; nor does a golden run that was given up."""
-    rig, _ = cut_after_3_s(DRIVE_BUS)
-    drive_through(rig, lambda share: None)
-    rig.drive_bus.cuts = 0
-    reasons = record_of(rig).invalid_reasons
-    assert len(reasons) == 2
-    assert "drive bus" in reasons[0]
-    assert "lost in full transmit queues" in reasons[0]
-    assert "given up without a fault" in reasons[1]
-
-
-def test_injections_at_or_after_the_end_of_the_motion_are_not_recorded() -> None:
-    """[0, duration): one ns before the end is the last start that counts, whatever an injector counts from."""
-    duration = SECOND
-    ends = [duration - 1, duration, duration + 1, duration + 100 * MS]
-    parts = [dropped(0x185, at_ns, 10 * MS, to_drives=False, name=f"n{at_ns}") for at_ns in ends]
-    late = dropped(0x186, 4 * SECOND, 10 * MS, to_drives=False, name="power up", from_power_up=True)
-    rig = finished(new_rig([*parts, late], duration_ns=duration))
-    rig.loop.run_until(5 * SECOND)
-    rig.gateway.finish(rig.loop.now)
-    record = record_of(rig)
-    assert [one.injector for one in record.activations] == [f"n{duration - 1}"]
-    assert record.activations[0].start_ns == record.time0_ns + duration - 1
-    assert record.completed
-    after = [one.injector for one in record.activations_after]
-    assert after == [one.injector for one in rig.gateway.records[1:]]
-    assert after[0] == f"n{duration}"
-    assert after[-1] == "power up"
 
 
 # ---- other bus plans ----------------------------------------------------------------------------------------------
