@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from canopen_exo.talk import tell
 from testbench.cli_campaign import add_campaign_verbs
 from testbench.cli_rig import CONTROL_ADDRESS, HUB_ADDRESS, add_rig_options, add_verbs, named_buses
 
@@ -31,19 +32,21 @@ _SIM_MODULES: Final = ("mujoco", "matplotlib", "pyarrow")
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one verb; returns the exit code."""
+    if sys.stderr is None:  # closed by whoever started it
+        sys.stderr = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115 - for as long as the process lives
     options = _parser().parse_args(arguments)
     verb: Callable[[argparse.Namespace], int] = options.verb
     try:
         return verb(options)
     except (KeyboardInterrupt, Exception) as error:  # noqa: BLE001 - the last resort: exit 1 would read as a verdict
         if _is_interrupt(error):
-            _say("interrupted")
+            tell("interrupted")
             return INTERRUPTED
         if isinstance(error, ModuleNotFoundError) and (error.name or "").partition(".")[0] in _SIM_MODULES:
-            _say(f"{error.name} is not installed; a run needs the extra sim: pip install 'exo-hil[sim]'")
+            tell(f"{error.name} is not installed; a run needs the extra sim: pip install 'exo-hil[sim]'")
             return USAGE
-        traceback.print_exc()
-        _say("exo-hil: this is a defect of the program; nothing about the scenario is proved")
+        tell(traceback.format_exc().rstrip())
+        tell("exo-hil: this is a defect of the program; nothing about the scenario is proved")
         return INVALID
 
 
@@ -137,10 +140,10 @@ def _run(options: argparse.Namespace) -> int:
         folder = options.out or default_folder(scenario.name, scenario.seed, changes)
         check_folder(folder)
     except (FileErrors, BenchError, FaultError) as error:
-        _say(_as_typed(error, options))
+        tell(_as_typed(error, options))
         return USAGE
     for warning in scenario.warnings:
-        _say(f"warning: {warning}")
+        tell(f"warning: {warning}")
 
     from canopen_exo.errors import CanopenExoError
     from joint_emulators.errors import JointEmulatorError
@@ -154,30 +157,30 @@ def _run(options: argparse.Namespace) -> int:
                 without = frozenset(options.without)
                 places = _places(options, without)
                 result = run_realtime(
-                    scenario, buses, without, fifo=options.fifo, places=places, progress=progress, announce=_say
+                    scenario, buses, without, fifo=options.fifo, places=places, progress=progress, announce=tell
                 )
             else:
                 from testbench.run import run_scenario
 
                 result = run_scenario(scenario, progress, None if replay is None else replay.windows)
     except (BenchError, JointEmulatorError, CanopenExoError) as error:
-        _say(f"{scenario.name}: run invalid: {error}")
+        tell(f"{scenario.name}: run invalid: {error}")
         return INVALID
     if replay is not None:
         result.document["replay"] = replay.entry(result.document)
     try:
         written = write_folder(folder, result)
     except BenchError as error:
-        _say(str(error))
+        tell(str(error))
         return USAGE
     _print(summary_json(result.document) if options.json else summary_text(result.document))
-    _say(f"result folder: {written}")
+    tell(f"result folder: {written}")
     if not result.document["valid"]:
         timing = result.document.get("realtime")
         if timing is not None and timing["late_cycles"]:
             from testbench.watch import too_busy
 
-            _say(too_busy(scenario.plan.cycle_ns))
+            tell(too_busy(scenario.plan.cycle_ns))
         return INVALID
     return PASS if result.judgement.passed else FAIL
 
@@ -244,11 +247,11 @@ def _check(options: argparse.Namespace) -> int:
             return check_campaign(options.scenario, options.overrides, options.seed, _print)
         found = load_any(options.scenario, overrides)
     except FileErrors as error:
-        _say(_as_typed(error, options))
+        tell(_as_typed(error, options))
         return USAGE
     _print("\n".join(describe_faults(found) if isinstance(found, FaultFile) else describe(found)) + "\n")
     for warning in found.warnings:
-        _say(f"warning: {warning}")
+        tell(f"warning: {warning}")
     return PASS
 
 
@@ -293,16 +296,12 @@ def _print(text: str) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except OSError as error:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        _say(f"stdout: {error.strerror or error}; the result could not be printed there")
+        tell(f"stdout: {error.strerror or error}; the result could not be printed there")
 
 
 def _as_typed(error: Exception, options: argparse.Namespace) -> str:
     """A complaint in the words of the command line: the seed came as --seed."""
     return str(error) if options.seed is None else str(error).replace("--set seed=", "--seed ")
-
-
-def _say(text: str) -> None:
-    print(text, file=sys.stderr)
 
 
 if __name__ == "__main__":

@@ -4,11 +4,11 @@ Nothing heavy is imported before a verb needs it.
 """
 
 import argparse
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Protocol
 
+from canopen_exo.talk import tell
 from testbench.errors import BenchError
 
 if TYPE_CHECKING:
@@ -234,7 +234,7 @@ def _served(serve: Callable[["ProcessOptions"], int], options: argparse.Namespac
         given = (options.epoch, options.part, options.fifo, options.supervisor, options.folder, options.busy_poll)
         return serve(ProcessOptions(*given))
     except (BenchError, CanopenExoError, FaultError) as error:
-        print(error, file=sys.stderr)
+        tell(error)
         return USAGE
 
 
@@ -252,10 +252,10 @@ def _read_faults(options: argparse.Namespace) -> "FaultFile | None":
         else:
             faults = no_faults()
     except FileErrors as error:
-        print(error, file=sys.stderr)
+        tell(error)
         return None
     for warning in [] if options.no_faults or options.supervisor else faults.warnings:
-        print(f"warning: {warning}", file=sys.stderr)
+        tell(f"warning: {warning}")
     return faults
 
 
@@ -269,7 +269,7 @@ def read_scenario(options: argparse.Namespace) -> "Scenario | None":
             return load_scenario(options.scenario, options.overrides)
         return parse_scenario(DEFAULT_SCENARIO, "default scenario", options.overrides)
     except FileErrors as error:
-        print(error, file=sys.stderr)
+        tell(error)
         return None
 
 
@@ -297,7 +297,7 @@ def _hub(options: argparse.Namespace) -> int:
         bitrate = HUB_BITRATE if bitrate is None else bitrate
         return hub_main(options.listen, options.timed, bitrate, _bus_maker(options))
     except BenchError as error:
-        print(f"hub: {error}", file=sys.stderr)
+        tell(f"hub: {error}")
         return USAGE
     finally:
         remove_orphaned(options.folder, options.supervisor)
@@ -327,15 +327,15 @@ def _fault(options: argparse.Namespace) -> int:
 
     word, name = options.word, options.name
     if word in NAMED and not name:
-        print(f"fault {word}: which injector? `exo-hil fault list` names them", file=sys.stderr)
+        tell(f"fault {word}: which injector? `exo-hil fault list` names them")
         return USAGE
     if name and word not in NAMED:
-        print(f"fault {word}: {name!r} given, allowed is nothing: it is about the whole gateway", file=sys.stderr)
+        tell(f"fault {word}: {name!r} given, allowed is nothing: it is about the whole gateway")
         return USAGE
     try:
         return fault_main(options.word, options.name, options.at)
     except FaultError as error:
-        print(error, file=sys.stderr)
+        tell(error)
         return USAGE
 
 
@@ -366,8 +366,8 @@ def _up(options: argparse.Namespace) -> int:
         )
         return run_up(setup)
     except ProcessError as error:
-        print(error, file=sys.stderr)
+        tell(error)
         return INVALID
     except (BenchError, CanopenExoError, FaultError) as error:
-        print(error, file=sys.stderr)
+        tell(error)
         return USAGE

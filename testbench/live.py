@@ -3,6 +3,7 @@
 import sys
 from typing import Final
 
+from canopen_exo.talk import tell
 from testbench.child import ProcessError
 from testbench.gateway_process import active_faults
 from testbench.status import StatusLine
@@ -22,7 +23,7 @@ def run_up(setup: Setup) -> int:
         if line is not None:
             line.clear()
         if not is_over:
-            print(text, file=sys.stderr, flush=True)
+            tell(text)
 
     def show(now: int) -> None:
         if line is not None:
@@ -46,5 +47,5 @@ def run_up(setup: Setup) -> int:
     except KeyboardInterrupt:
         if line is not None:
             line.clear()
-        print("stopped", file=sys.stderr)
+        tell("stopped")
     return PASS

@@ -27,6 +27,7 @@ from canopen_exo.bus.node import MS, NEVER, SECOND, Node
 from canopen_exo.bus.realtime import RealTimeLoop
 from canopen_exo.bus.scheduling import release_fifo, request_fifo
 from canopen_exo.errors import CanopenExoError
+from canopen_exo.talk import tell
 from testbench.errors import BenchError
 
 if TYPE_CHECKING:  # numpy, and with it everything heavy
@@ -349,4 +350,4 @@ def remove_orphaned(folder: Path | None, supervisor: int, is_hung_up: bool = Fal
 
 def say(name: str, text: str) -> None:
     """One line of talk, to stderr."""
-    print(f"{name}: {text}", file=sys.stderr, flush=True)
+    tell(f"{name}: {text}")

@@ -9,6 +9,7 @@ from typing import Final, TextIO, final
 
 from canopen_exo.bus.node import MS, NEVER, ErrorState
 from canopen_exo.plan import STATUS_MOTION, STATUS_STARTING, STATUS_STOPPED
+from canopen_exo.talk import put
 from testbench.watch import Watch, states_text
 
 EVERY_NS: Final = 250 * MS
@@ -33,8 +34,7 @@ class StatusLine:
         """Rewrite the line when it is time."""
         if not self._is_on or now < self._next_ns:
             return
-        self._stream.write(f"\r\x1b[K{_cut(self.text(now), self._width())}")
-        self._stream.flush()
+        put(self._stream, f"\r\x1b[K{_cut(self.text(now), self._width())}")
         self._next_ns = now + EVERY_NS
 
     def _width(self) -> int:
@@ -47,8 +47,7 @@ class StatusLine:
     def clear(self) -> None:
         """Make room for another line."""
         if self._is_on:
-            self._stream.write("\r\x1b[K")
-            self._stream.flush()
+            put(self._stream, "\r\x1b[K")
             self._next_ns = -NEVER
 
     def text(self, now: int) -> str:
