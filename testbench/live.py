@@ -19,18 +19,21 @@ def run_up(setup: Setup) -> int:
 
     is_over = False
 
-    def say(text: str) -> None:
+    def announce(text: str) -> None:
         if line is not None:
             line.clear()
+        tell(text)
+
+    def say(text: str) -> None:
         if not is_over:
-            tell(text)
+            announce(text)
 
     def show(now: int) -> None:
         if line is not None:
             line.show(now)
 
     try:
-        with Supervisor(setup, say, show, announce=say) as rig:
+        with Supervisor(setup, say, show, announce=announce) as rig:
             rig.start()
             for what, bus in zip(("controller bus", "drive bus"), rig.buses, strict=True):
                 say(f"{what}: {bus}")

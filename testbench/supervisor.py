@@ -98,7 +98,8 @@ class Supervisor:
     watch: the listener on both buses; processes: by name.
     say: told each line that a process prints, which its obituary then leaves out;
     tick: called with the loop's time at least every 50 ms;
-    announce: told what foreign software is waited for, and where; hub: of another supervisor, watched and not ended.
+    announce: told what foreign software is waited for, and where, and who had to be killed;
+    hub: of another supervisor, watched and not ended.
     """
 
     def __init__(
@@ -195,7 +196,10 @@ class Supervisor:
             self._mourn(dead)
 
     def stop(self) -> None:
-        """End all that runs in order: controller, gateway, joints, hub. A second interrupt kills."""
+        """End all that runs in order: controller, gateway, joints, hub. One that does not in time is killed and named.
+
+        A second interrupt kills.
+        """
         before = self.orders.count
         for name in ("hlc", "gateway", "joints", "hub"):
             process = self.processes.get(name)
@@ -208,6 +212,10 @@ class Supervisor:
             while process.code is None and self.now() < limit and self.orders.count <= before:
                 self._idle(process)
             if process.code is None:
+                why = "was not waited for" if self.orders.count > before else f"did not end in {END_NS / SECOND:g} s"
+                self._announce(f"{name} {why} and was killed")
+                if self._loop is not None:
+                    self._loop.remove_reader(process)
                 process.close()
 
     # --- what it knows -------------------------------------------------------------------------------------------

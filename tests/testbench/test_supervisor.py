@@ -153,6 +153,22 @@ def test_killed_process_is_named_and_the_others_react_and_end(name: str, patienc
     check_killed(HUB, name, patience)
 
 
+@linux
+def test_process_that_hangs_is_killed_and_named_and_the_others_end_in_order(
+    scenario: Scenario, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A stopped process does not hear SIGTERM: it is waited for as long as any other, and no longer."""
+    monkeypatch.setattr(supervisor, "END_NS", 3 * SECOND)
+    told: list[str] = []
+    with nothing_left(Supervisor(Setup(scenario), announce=told.append)) as rig:
+        rig.start(["joints", "gateway"])
+        os.kill(rig.processes["gateway"].pid, signal.SIGSTOP)
+        rig.stop()
+        codes = {name: process.code for name, process in rig.processes.items()}
+    assert told == ["gateway did not end in 3 s and was killed"]
+    assert codes == {"hub": 0, "joints": 0, "gateway": -signal.SIGKILL}
+
+
 # --- not started -----------------------------------------------------------------------------------------------------
 
 
