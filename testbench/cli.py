@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 
 from canopen_exo.talk import tell
 from testbench.cli_campaign import add_campaign_verbs
-from testbench.cli_rig import CONTROL_ADDRESS, HUB_ADDRESS, add_rig_options, add_verbs, named_buses
+from testbench.cli_rig import CONTROL_ADDRESS, HUB_ADDRESS, add_control_frames, add_rig_options, add_verbs, named_buses
 
 if TYPE_CHECKING:
     from testbench.replay import Replay
@@ -82,6 +82,7 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("--json", action="store_true", help="print the result as one JSON document")
     run.add_argument("--realtime", action="store_true", help="as processes against the clock, not in virtual time")
     add_rig_options(run)
+    add_control_frames(run)
     run.set_defaults(verb=_run)
 
     check = verbs.add_parser("check", help="validate a scenario and say what it will do", description=_check.__doc__)
@@ -132,8 +133,10 @@ def _run(options: argparse.Namespace) -> int:
         scenario, replay = _loaded(options)
         buses = _real_time_buses(options)
         if options.realtime:
+            from testbench.gateway_process import check_control_frames
             from testbench.realtime_run import check_without
 
+            check_control_frames(options.control_frames, options.without, is_judged=True)
             check_without(scenario, frozenset(options.without))
             refuse_wire_faults(scenario.injectors, "exo-hil run --realtime")
         changes = [*options.overrides, *(("replay",) if replay is not None else ())]
@@ -157,7 +160,14 @@ def _run(options: argparse.Namespace) -> int:
                 without = frozenset(options.without)
                 places = _places(options, without)
                 result = run_realtime(
-                    scenario, buses, without, fifo=options.fifo, places=places, progress=progress, announce=tell
+                    scenario,
+                    buses,
+                    without,
+                    fifo=options.fifo,
+                    places=places,
+                    control_frames=options.control_frames,
+                    progress=progress,
+                    announce=tell,
                 )
             else:
                 from testbench.run import run_scenario
@@ -224,7 +234,7 @@ def _real_time_buses(options: argparse.Namespace) -> tuple[str, str] | None:
     from testbench.errors import BenchError
 
     buses = named_buses(options)
-    of_real_time = ("controller_bus", "drive_bus", "without", "listen", "control", "fifo")
+    of_real_time = ("controller_bus", "drive_bus", "without", "listen", "control", "control_frames", "fifo")
     given = [f"--{name.replace('_', '-')}" for name in of_real_time if getattr(options, name)]
     if given and not options.realtime:
         raise BenchError(f"{', '.join(given)}: {'is' if len(given) == 1 else 'are'} of real time; add --realtime")

@@ -54,6 +54,7 @@ def add_verbs(verbs: Verbs) -> None:
     up = verbs.add_parser("up", help="the whole rig as real-time processes until Ctrl-C", description=_up.__doc__)
     _add_scenario(up)
     add_rig_options(up)
+    add_control_frames(up)
     up.add_argument("--no-faults", action="store_true", help="without the scenario's injectors")
     up.set_defaults(verb=_up)
 
@@ -86,11 +87,7 @@ def add_verbs(verbs: Verbs) -> None:
     gateway.add_argument(
         "--control", metavar="ADDRESS", default="", help=f"live control at HOST:PORT or a path: {CONTROL_ADDRESS}"
     )
-    gateway.add_argument(
-        "--control-frames",
-        metavar="SIDE[:COMMAND,STATUS]",
-        help="live control by frames on the controller or drive side, as in drive:0x6C0,0x6C1",
-    )
+    add_control_frames(gateway)
     gateway.set_defaults(verb=_gateway)
 
     fault = verbs.add_parser("fault", help="live control of a running gateway", description=_fault.__doc__)
@@ -128,6 +125,16 @@ def add_rig_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--listen", metavar="HOST:PORT", help=f"of the own hub (default: {HUB_ADDRESS} {known})")
     parser.add_argument("--control", metavar="ADDRESS", help=f"of the gateway (default: {CONTROL_ADDRESS} {known})")
     parser.add_argument("--fifo", action="store_true", help="real-time scheduling (SCHED_FIFO), where permitted")
+
+
+def add_control_frames(parser: argparse.ArgumentParser) -> None:
+    """Live control over the bus: of the gateway, and of what starts one."""
+    parser.add_argument(
+        "--control-frames",
+        metavar="SIDE[:COMMAND,STATUS]",
+        default="",
+        help="live control by frames on the controller or drive side, as in drive:0x6C0,0x6C1",
+    )
 
 
 def named_buses(options: argparse.Namespace) -> tuple[str, str] | None:
@@ -218,7 +225,7 @@ def _gateway(options: argparse.Namespace) -> int:
             return USAGE
         buses = (_bus(options.controller_bus, "controller"), _bus(options.drive_bus, "drive"))
         check_two(*buses)
-        frames = None if options.control_frames is None else control_frames(options.control_frames)
+        frames = control_frames(options.control_frames) if options.control_frames else None
         return gateway_main(faults, buses, how, GatewayOptions(not options.no_faults, options.control, frames))
 
     return _served(serve, options)
@@ -345,6 +352,7 @@ def _up(options: argparse.Namespace) -> int:
     from fi_gateway.errors import FaultError
     from fi_gateway.schema import refuse_wire_faults
     from testbench.child import ProcessError
+    from testbench.gateway_process import check_control_frames
     from testbench.live import run_up
     from testbench.supervisor import Setup
 
@@ -354,6 +362,7 @@ def _up(options: argparse.Namespace) -> int:
     try:
         if not options.no_faults:
             refuse_wire_faults(scenario.injectors, "exo-hil up")
+        check_control_frames(options.control_frames, options.without, is_judged=False)
         setup = Setup(
             scenario,
             named_buses(options),
@@ -363,6 +372,7 @@ def _up(options: argparse.Namespace) -> int:
             fifo=options.fifo,
             listen=options.listen or HUB_ADDRESS,
             control=options.control or CONTROL_ADDRESS,
+            control_frames=options.control_frames,
         )
         return run_up(setup)
     except ProcessError as error:

@@ -13,6 +13,7 @@ import hashlib
 import logging
 import socket
 import sys
+from collections.abc import Collection
 from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
@@ -37,6 +38,7 @@ from fi_gateway.control_socket import ControlServer
 from fi_gateway.errors import FaultError
 from fi_gateway.gateway import CONTROLLER_PORT, DRIVE_PORT, Gateway
 from testbench.errors import BenchError
+from testbench.pairing import is_request
 from testbench.process import DONE, INVALID, ProcessOptions, Session, say, session
 
 if TYPE_CHECKING:
@@ -167,6 +169,20 @@ def control_frames(text: str) -> ControlFrames:
     except ValueError as error:
         raise BenchError(wrong) from error
     return ControlFrames(SIDES[side], command_id, status_id)
+
+
+def check_control_frames(text: str, without: Collection[str], *, is_judged: bool) -> None:
+    """Whether the gateway of a rig can take those frames; raises BenchError. is_judged: the run counts lost frames."""
+    if not text:
+        return
+    frames = control_frames(text)
+    if "gateway" in without:
+        raise BenchError(f"--control-frames {text}: our gateway reads them, and it is left out; leave out one of them")
+    if is_judged and not (is_request(frames.command_id) and is_request(frames.status_id)):
+        raise BenchError(
+            f"--control-frames {text}: COB-IDs 0x601 to 0x6FF are allowed in a run that is judged; others would count "
+            "as frames lost in the gateway"
+        )
 
 
 def fault_main(word: str, name: str, address: str) -> int:

@@ -66,7 +66,8 @@ class Setup:
 
     faults: with the scenario's injectors; endless: walk until stopped; keep_parts: have each process leave its part;
     record: keep `rows`; listen: HOST:PORT of an own hub, port 0 for a free one; control: address of the gateway's live
-    control, "" for a Unix socket in the rig's folder (where there are such sockets).
+    control, "" for a Unix socket in the rig's folder (where there are such sockets); control_frames: as the option of
+    `exo-hil gateway`, "" for none.
     """
 
     scenario: Scenario
@@ -79,6 +80,7 @@ class Setup:
     fifo: bool = False
     listen: str = "127.0.0.1:0"
     control: str = ""
+    control_frames: str = ""
 
 
 def check_status_readers(setup: Setup) -> None:
@@ -274,6 +276,8 @@ class Supervisor:
             arguments = ["--controller-bus", controller_bus, "--drive-bus", drive_bus, *self._common("gateway")]
             if self.control_address:
                 arguments += ["--control", self.control_address]
+            if self.setup.control_frames:
+                arguments += ["--control-frames", self.setup.control_frames]
             self._spawn("gateway", [*arguments, *([] if self.setup.faults else ["--no-faults"])])
         else:
             both = f"{controller_bus} and {drive_bus}"

@@ -28,7 +28,7 @@ _PLACES: Final = pytest.StashKey[pytest.TempPathFactory]()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """`--exo-bus`, `--exo-scenario`, `--exo-set`, `--exo-without`, `--exo-fifo`."""
+    """`--exo-bus`, `--exo-scenario`, `--exo-set`, `--exo-without`, `--exo-fifo`, `--exo-control-frames`."""
     group = parser.getgroup("exo-hil", "exoskeleton rig under test (exo-hil)")
     group.addoption(
         "--exo-bus",
@@ -59,6 +59,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         "--exo-fifo",
         action="store_true",
         help="against the clock: real-time scheduling (SCHED_FIFO) for the processes of the rig, where permitted",
+    )
+    group.addoption(
+        "--exo-control-frames",
+        default="",
+        metavar="SIDE[:COMMAND,STATUS]",
+        help="live control by frames on the controller or drive side of the gateway, as in drive:0x6C0,0x6C1",
     )
 
 
@@ -156,6 +162,7 @@ def _open(request: pytest.FixtureRequest) -> "Exo":
     from canopen_exo.errors import CanopenExoError
     from fi_gateway.errors import FaultError
     from testbench.errors import BenchError
+    from testbench.gateway_process import check_control_frames
 
     config = request.config
     bus, without = config.getoption("--exo-bus"), frozenset(config.getoption("--exo-without"))
@@ -170,13 +177,15 @@ def _open(request: pytest.FixtureRequest) -> "Exo":
                 f"--exo-without {' '.join(sorted(without))}: nobody else knows where the hub of a test is; start "
                 "`exo-hil hub --timed` and name its buses: --exo-bus hub:controller,drive"
             )
+        frames: str = config.getoption("--exo-control-frames")
+        check_control_frames(frames, without, is_judged=False)
         if bus == LOCKSTEP:
             from testbench.plugin.lockstep import open_lockstep
 
-            return open_lockstep(scenario, goldens, without)
+            return open_lockstep(scenario, goldens, without, frames)
         from testbench.plugin.realtime import RealTimeExo
 
-        return RealTimeExo(scenario, bus, buses, without, goldens, fifo=config.getoption("--exo-fifo"))
+        return RealTimeExo(scenario, bus, buses, without, goldens, config.getoption("--exo-fifo"), frames)
     except (BenchError, CanopenExoError, FaultError) as error:
         wrong = str(error)
     pytest.fail(f"exo: {wrong}", pytrace=False)  # out here, so that pytest does not show the same line as its cause

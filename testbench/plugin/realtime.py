@@ -89,7 +89,7 @@ class RealTimeGateway(GatewayControl):
 
 @final
 class RealTimeExo(Exo):
-    """A rig of processes. buses: of controller and drives, None for an own hub; without, fifo: as Setup."""
+    """A rig of processes. buses: of controller and drives, None for an own hub; the rest: as Setup."""
 
     def __init__(
         self,
@@ -99,10 +99,13 @@ class RealTimeExo(Exo):
         without: frozenset[str],
         goldens: Goldens,
         fifo: bool = False,
+        control_frames: str = "",
     ) -> None:
         self._injectors: Final = RealTimeGateway(scenario)
         super().__init__(scenario, bus, self._injectors, goldens)
-        self._setup: Final[Setup] = Setup(scenario, buses, without, record=True, fifo=fifo)
+        self._setup: Final[Setup] = Setup(
+            scenario, buses, without, record=True, fifo=fifo, control_frames=control_frames
+        )
         self._stack: Final = contextlib.ExitStack()
         self._rig: Supervisor | None = None
         self._rows: list[Transmission] = []

@@ -469,3 +469,14 @@ def test_fifo_is_asked_for_where_the_command_line_says_so(pytester: pytest.Pytes
     """`--exo-fifo` reaches the processes of the rig; the rig itself is not started here."""
     pytester.makepyfile(f"def test_it(exo):\n    assert exo._setup.fifo is {asked}\n")
     run(pytester, "--exo-bus", "hub", *(["--exo-fifo"] if asked else [])).assert_outcomes(passed=1)
+
+
+def test_control_frames_of_the_command_line_reach_the_rig(pytester: pytest.Pytester) -> None:
+    """`--exo-control-frames`, on every kind of bus; wrong ones fail the test in a line."""
+    pytester.makepyfile("def test_it(exo):\n    assert exo._setup.control_frames == 'drive'\n")
+    run(pytester, "--exo-bus=hub", "--exo-control-frames=drive").assert_outcomes(passed=1)
+    pytester.makepyfile("def test_it(exo):\n    assert exo._injectors._frames.command_id == 0x6C2\n")
+    run(pytester, "--exo-control-frames=drive:0x6C2,0x6C3").assert_outcomes(passed=1)
+    wrong = run(pytester, "--exo-control-frames=middle")
+    wrong.assert_outcomes(errors=1)
+    wrong.stdout.fnmatch_lines(["*allowed is controller or drive*"])

@@ -14,11 +14,14 @@ import subprocess
 import sys
 from pathlib import Path
 
+import can
 import canopen
 import pytest
 
 from canopen_exo.bus.node import SECOND
 from canopen_exo.cia402 import DriveState
+from fi_gateway.bus_control import DEFAULT_COMMAND_ID, DEFAULT_STATUS_ID, Command, Status, read_status
+from fi_gateway.bus_control import DONE as DONE_OVER_BUS
 from testbench import supervisor
 from testbench.child import Process, ProcessError
 from testbench.cli import INVALID, USAGE, main
@@ -265,6 +268,41 @@ def test_bus_that_is_not_there_is_told_before_anything_starts(scenario: Scenario
         with pytest.raises(BenchError, match="exo-hil hub"):
             rig.start()
         assert rig.processes == {}
+
+
+# --- live control over the bus ---------------------------------------------------------------------------------------
+
+
+def test_gateway_of_a_rig_takes_commands_over_the_bus() -> None:
+    """docs/live_control.md: `--control-frames` of `up` and `run --realtime` reaches the gateway of the rig."""
+    with nothing_left(Supervisor(Setup(HUB.scenario("bias"), control_frames="controller"))) as rig:
+        rig.start(["joints", "gateway"])
+        with can.Bus(rig.buses[0].removeprefix("hub:"), "hub") as tester:
+            command = Command(7, 0, 1).frame(DEFAULT_COMMAND_ID)  # a question
+            tester.send(can.Message(arbitration_id=command.can_id, data=command.data, is_extended_id=False))
+            tester.set_filters([{"can_id": DEFAULT_STATUS_ID, "can_mask": 0x7FF, "extended": False}])
+            answer = tester.recv(LONG_NS / SECOND)
+    assert answer is not None
+    assert read_status(bytes(answer.data)) == Status(DONE_OVER_BUS, 0, 1, 0, "inert")
+
+
+@pytest.mark.parametrize("verb", ["up", "run"])
+def test_command_line_hands_control_frames_to_the_rig(
+    verb: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is given becomes part of the Setup; no rig is started here."""
+    (tmp_path / "rig.yaml").write_text(TEXT)
+    asked: list[Setup] = []
+
+    def refuse(setup: Setup, *given: object) -> int:
+        asked.append(setup)
+        raise BenchError("enough")
+
+    monkeypatch.setattr("testbench.live.run_up", refuse)
+    monkeypatch.setattr("testbench.realtime_run._run_pair", refuse)
+    options = [] if verb == "up" else ["--realtime", "--out", str(tmp_path / "result")]
+    main([verb, str(tmp_path / "rig.yaml"), "--control-frames", "drive:0x6C2,0x6C3", *options])
+    assert [setup.control_frames for setup in asked] == ["drive:0x6C2,0x6C3"]
 
 
 # --- foreign controller ----------------------------------------------------------------------------------------------
