@@ -207,8 +207,8 @@ def test_status_line_has_load_lateness_drive_states_and_active_faults() -> None:
     assert watch.time_zero == 390 * MS
     share = 100 * watch.bits[0] / 500_000
     assert text == (
-        "walking 0.1 s | faults: freeze_position | drive bus bus off | drives: 1 operation enabled, 5 no status | "
-        f"load {share:.0f} %, 0 % | late 0 of 48 cycles, SYNC off by at most 0.0 ms"
+        "walking 0.1 s | drive bus bus off | 1 enabled, 5 no status | "
+        f"load {share:.0f}, 0 % | late 0/48, 0.0 ms | 1 fault: freeze_position"
     )
 
 
@@ -224,7 +224,22 @@ def test_status_line_never_wraps(columns: int, monkeypatch: pytest.MonkeyPatch) 
     shown = terminal.getvalue().removeprefix("\r\x1b[K")
     assert len(shown) < columns or shown == whole
     assert (shown == whole) == (columns in (0, 500))
-    assert whole.startswith(shown)
+    assert whole.startswith(shown.rstrip("."))
+
+
+def test_status_line_of_80_columns_has_load_and_lateness_also_while_faults_act(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They count most then; it is the names of faults that are cut."""
+    terminal = Terminal()
+    monkeypatch.setattr(terminal, "fileno", lambda: 2)
+    monkeypatch.setattr(os, "get_terminal_size", lambda fd: os.terminal_size((80, 25)))
+    watch = Watch(PLAN)
+    watch.states.update(dict.fromkeys(JOINT_NAMES, DriveState.OPERATION_ENABLED))
+    watch.motion, watch.time_zero = STATUS_MOTION, 0
+    watch.cycles, watch.late, watch.worst_ns = 41_400, 99, 15_300_000
+    StatusLine(watch, terminal, lambda: ["freeze_position", "zero_velocity"]).show(123 * SECOND)
+    shown = terminal.getvalue().removeprefix("\r\x1b[K")
+    assert shown.startswith("walking 123.0 s | 6 enabled | load 0, 0 % | late 99/41400, 15.3 ms | 2 fault")
+    assert shown.endswith("...")
 
 
 def test_status_line_is_rewritten_in_place_and_only_on_a_terminal() -> None:
