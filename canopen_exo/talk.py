@@ -1,4 +1,4 @@
-"""Talk of a process: lines on stderr. Whether anybody reads them changes nothing about what the process does.
+"""What a process prints: talk on stderr, its result on stdout. Whether anybody reads it changes nothing about the rest.
 
 A reader that is gone (Ctrl-C goes to a whole pipeline and ends its `tee`), a full disk, a terminal that was closed.
 """
@@ -24,6 +24,13 @@ def put(stream: TextIO | None, text: str) -> OSError | None:
         os.close(nowhere)
         return error
     return None
+
+
+def show(text: str) -> None:
+    """The result, to stdout. A reader that has left (`| head`) is not worth a word, anything else is."""
+    error = put(sys.stdout, text)
+    if error is not None and not isinstance(error, BrokenPipeError):
+        tell(f"stdout: {error.strerror or error}; the result could not be printed there")
 
 
 def tell(text: object) -> None:

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from canopen_exo.talk import tell
+from canopen_exo.talk import show, tell
 from testbench.cli_campaign import add_campaign_verbs
 from testbench.cli_rig import CONTROL_ADDRESS, HUB_ADDRESS, add_control_frames, add_rig_options, add_verbs, named_buses
 
@@ -91,7 +91,7 @@ def _parser() -> argparse.ArgumentParser:
     check.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="overrides", help="as for run")
     check.set_defaults(verb=_check)
 
-    add_campaign_verbs(verbs, _print)
+    add_campaign_verbs(verbs, show)
     add_verbs(verbs)
 
     export = verbs.add_parser("export", help="write files for other tools", description=_export.__doc__)
@@ -112,7 +112,7 @@ class _Version(argparse.Action):
     ) -> None:
         from importlib.metadata import version
 
-        print(f"exo-hil {version('exo-hil')}")
+        show(f"exo-hil {version('exo-hil')}\n")
         parser.exit()
 
 
@@ -183,7 +183,7 @@ def _run(options: argparse.Namespace) -> int:
     except BenchError as error:
         tell(str(error))
         return USAGE
-    _print(summary_json(result.document) if options.json else summary_text(result.document))
+    show(summary_json(result.document) if options.json else summary_text(result.document))
     tell(f"result folder: {written}")
     if not result.document["valid"]:
         timing = result.document.get("realtime")
@@ -254,12 +254,12 @@ def _check(options: argparse.Namespace) -> int:
         overrides.append(f"seed={options.seed}")
     try:
         if is_campaign_file(options.scenario):
-            return check_campaign(options.scenario, options.overrides, options.seed, _print)
+            return check_campaign(options.scenario, options.overrides, options.seed, show)
         found = load_any(options.scenario, overrides)
     except FileErrors as error:
         tell(_as_typed(error, options))
         return USAGE
-    _print("\n".join(describe_faults(found) if isinstance(found, FaultFile) else describe(found)) + "\n")
+    show("\n".join(describe_faults(found) if isinstance(found, FaultFile) else describe(found)) + "\n")
     for warning in found.warnings:
         tell(f"warning: {warning}")
     return PASS
@@ -272,12 +272,12 @@ def _export(options: argparse.Namespace) -> int:
 
         from testbench.scenario import scenario_schema
 
-        _print(json.dumps(scenario_schema(), indent=2) + "\n")
+        show(json.dumps(scenario_schema(), indent=2) + "\n")
         return PASS
     from importlib.resources import files
 
     name = {"eds": "exo_joint.eds", "dbc": "exo.dbc"}[options.what]
-    _print((files("dbc") / name).read_text(encoding="utf-8"))
+    show((files("dbc") / name).read_text(encoding="utf-8"))
     return PASS
 
 
@@ -295,18 +295,6 @@ def _progress(name: str) -> Iterator[Callable[[float], None]]:
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(name, total=1.0)
         yield lambda share: bar.update(task, completed=share)
-
-
-def _print(text: str) -> None:
-    """The result, to stdout. A reader that has left (`| head`) changes nothing about the exit code."""
-    try:
-        sys.stdout.write(text)
-        sys.stdout.flush()
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    except OSError as error:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        tell(f"stdout: {error.strerror or error}; the result could not be printed there")
 
 
 def _as_typed(error: Exception, options: argparse.Namespace) -> str:

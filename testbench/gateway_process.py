@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Final
 
 from canopen_exo.bus.interfaces import BusName, bus_identity
 from canopen_exo.bus.node import NEVER, SECOND
+from canopen_exo.talk import show
 from fi_gateway.bus_control import DEFAULT_COMMAND_ID, DEFAULT_STATUS_ID, BusControl
 from fi_gateway.control import (
     ARM,
@@ -192,9 +193,9 @@ def fault_main(word: str, name: str, address: str) -> int:
 
     if word in WORDS:
         done = ask(address, word, name).get("done") is True
-        sys.stdout.write((_DONE[word] if done else _IGNORED).format(name=name) + "\n")
+        show((_DONE[word] if done else _IGNORED).format(name=name) + "\n")
     else:
-        sys.stdout.write(ask_listing(address).text() + "\n")
+        show(ask_listing(address).text() + "\n")
     return DONE
 
 

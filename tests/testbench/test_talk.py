@@ -49,6 +49,29 @@ def test_gateway_whose_talk_nobody_reads_passes_frames_after_an_interrupt() -> N
         assert hub.wait(PATIENCE_S) == 0
 
 
+@pytest.mark.parametrize(
+    ("where", "said"),
+    [
+        ("| true", ""),
+        ("> /dev/full", "stdout: No space left on device; the result could not be printed there\n"),
+        (">&-", "stdout: it is closed; the result could not be printed there\n"),
+    ],
+)
+@pytest.mark.parametrize("verb", ["export dbc", "fault arm x", "fault list", "--version"])
+def test_result_that_cannot_be_printed_is_no_defect(verb: str, where: str, said: str) -> None:
+    """The verb has done what it was asked to: its exit code stays, and the reason is one line."""
+    code = (
+        "import sys; from types import SimpleNamespace\n"
+        "from fi_gateway import control_socket; from testbench import cli\n"
+        "control_socket.ask = lambda *given: {'done': True}\n"
+        "control_socket.ask_listing = lambda *given: SimpleNamespace(text=lambda: 'nothing')\n"
+        "sys.exit(cli.main(sys.argv[1:]))"
+    )
+    shell = f'{sys.executable} -c "{code}" {verb} {where}; exit ${{PIPESTATUS[0]}}'
+    done = subprocess.run(["bash", "-c", shell], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, said)
+
+
 @pytest.mark.parametrize("is_closed", [False, True])
 def test_defect_that_cannot_be_told_is_no_verdict(is_closed: bool) -> None:
     """Exit 3 whether the reader of stderr has gone, or stderr was closed from the beginning."""
