@@ -66,7 +66,7 @@ class StatusLine:
         parts += [
             states_text(watch.states.values()).replace("operation enabled", "enabled"),
             f"load {loads[0]:.0f}, {loads[1]:.0f} %",
-            f"late {watch.late}/{watch.cycles}, {watch.worst_ns / 1e6:.1f} ms",
+            f"late {watch.late}/{watch.cycles}, {watch.offsets.worst_ns / 1e6:.1f} ms",
         ]
         faults = self._faults()
         if faults:

@@ -138,10 +138,8 @@ class RealTimeExo(Exo):
         if rig is None:
             return ""
         watch = rig.watch
-        return (
-            f"timing: {watch.late} of {watch.cycles} cycles late, SYNC off by at most {watch.worst_ns / 1e6:.1f} ms; "
-            f"{rig.missed} frames not heard"
-        )
+        late = f"{watch.late} of {watch.cycles} cycles late"
+        return f"timing: {late}, {watch.sync_words()}; {rig.missed} frames not heard"
 
     def close(self) -> None:
         """Stop all processes in order."""

@@ -63,7 +63,8 @@ def test_rig_told_to_end_leaves_the_drives_disabled(scenario: Scenario, patience
             assert {name: process.code for name, process in rig.processes.items()} == dict.fromkeys(rig.processes, 0)
             states = set(rig.watch.states.values())
             if states != {DriveState.SWITCH_ON_DISABLED} and rig.now() > told_ns + LEAVE_NS:
-                return Late(f"the controller did not get the drives disabled in {LEAVE_NS / 1e9:g} s")
+                words = rig.watch.sync_words()
+                return Late(f"the controller did not get the drives disabled in {LEAVE_NS / 1e9:g} s; {words}")
             return states
 
     assert patience.until_punctual(attempt) == {DriveState.SWITCH_ON_DISABLED}
@@ -139,7 +140,7 @@ def attempt_up(folder: Path, number: signal.Signals) -> int | Late:
         up.stderr.close()
     if code == INVALID:  # drives that missed SYNC for five cycles have stopped by themselves before they were told
         assert gave_up_late("".join(said)), said
-        return Late("".join(said)[-300:])
+        return Late("".join(said)[-600:])
     assert len(children) == 4, said
     assert any(re.match(r"controller bus: hub:127\.0\.0\.1:\d+/controller", line) for line in said)
     where = control.replace(":0", r":[1-9]\d*")  # the port that was free
