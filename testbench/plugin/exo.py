@@ -142,6 +142,11 @@ class Exo:
         """How well it keeps time, in words; "" where time is virtual."""
         return ""
 
+    @property
+    def lateness(self) -> str:
+        """What a run would be invalid for, in words; "" for a rig that kept time, and where time is virtual."""
+        return ""
+
     def frames(self, bus: str, last: int = 50) -> list[Transmission]:
         """The last frames of bus "controller" or "drive", oldest first."""
         index = bus_index(bus)

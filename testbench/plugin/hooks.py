@@ -5,6 +5,7 @@ for the fixture; without the extra `sim` only that test fails, saying so.
 """
 
 import re
+import warnings
 from collections.abc import Generator, Iterator
 from contextlib import closing
 from pathlib import Path
@@ -34,6 +35,10 @@ _WHY: Final = pytest.StashKey[str]()
 
 _EXO: Final = pytest.StashKey["Exo"]()
 _PLACES: Final = pytest.StashKey[pytest.TempPathFactory]()
+
+
+class LateRigWarning(UserWarning):
+    """A test whose rig was later than its scenario allows a real-time run to be."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -134,6 +139,8 @@ def exo(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
         request.node.stash[_PLACES] = tmp_path_factory
         request.node.stash[_EXO] = rig
         yield rig
+        if rig.lateness:
+            warnings.warn(LateRigWarning(rig.lateness), stacklevel=1)
 
 
 @pytest.hookimpl(wrapper=True)

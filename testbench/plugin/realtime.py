@@ -141,12 +141,35 @@ class RealTimeExo(Exo):
         late = f"{watch.late} of {watch.cycles} cycles late"
         return f"timing: {late}, {watch.sync_words()}; {rig.missed} frames not heard"
 
+    @property
+    def lateness(self) -> str:
+        """Beyond the limits of the scenario, as far as the supervisor hears it.
+
+        Answers may also be late or missing because of a fault: cycles are judged where none has acted, SYNC always.
+        """
+        rig, limits = self._rig, self.scenario.realtime
+        if rig is None:
+            return ""
+        watch = rig.watch
+        is_late = watch.late > limits.late_share * watch.cycles and not self._has_acted()
+        if not is_late and watch.offsets.worst_ns <= limits.late_worst_ns:
+            return ""
+        allowed = f"allowed {100 * limits.late_share:g} %, {limits.late_worst_ns / 1e6:g} ms"
+        return f"the rig was late, {allowed}: {self.timing.removeprefix('timing: ')}"
+
     def close(self) -> None:
         """Stop all processes in order."""
         for channel in self._senders.values():
             channel.close()
         self._senders.clear()
         self._stack.close()
+
+    def _has_acted(self) -> bool:
+        """Whether a fault has, or may have."""
+        try:
+            return any(row.activated for row in self._injectors.listing())
+        except FaultError:  # the gateway is gone
+            return True
 
     def _start(self) -> None:
         if self._rig is None:

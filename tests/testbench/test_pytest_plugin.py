@@ -529,3 +529,13 @@ def test_control_frames_of_the_command_line_reach_the_rig(pytester: pytest.Pytes
     wrong = run(pytester, "--exo-control-frames=middle")
     wrong.assert_outcomes(errors=1)
     wrong.stdout.fnmatch_lines(["*allowed is controller or drive*"])
+
+
+def test_a_rig_that_was_late_is_warned_of_though_its_test_has_passed(pytester: pytest.Pytester) -> None:
+    """The limits of the scenario, as a run has them; whoever wants a failure makes an error of the warning."""
+    pytester.makeconftest("from testbench.plugin.lockstep import LockStepExo\nLockStepExo.lateness = 'too late'")
+    pytester.makepyfile("def test_it(exo): pass")
+    result = run_apart(pytester)
+    result.assert_outcomes(passed=1, warnings=1)
+    result.stdout.fnmatch_lines(["*LateRigWarning: too late"])
+    run_apart(pytester, "-W", "error::testbench.plugin.hooks.LateRigWarning").assert_outcomes(passed=1, errors=1)
