@@ -248,7 +248,7 @@ class Exo:
         if found is not None:
             raise AssertionError(f"{self._words(wanted)} was not to come within {within}:\n{self.text_of(found)}")
 
-    def send(self, cob_id: int, data: bytes, *, bus: str) -> None:
+    def send(self, cob_id: int, data: bytes, *, bus: str = "controller") -> None:
         """Put a frame with an 11-bit id on bus "controller" or "drive", as one more node on it."""
         self._start()
         self._send(bus_index(bus), Frame(cob_id, data))

@@ -235,6 +235,14 @@ def test_a_sent_frame_passes_the_gateway() -> None:
     assert exo.frames("controller", last=1) == [seen]
 
 
+def test_a_sent_frame_goes_on_the_controller_bus_unless_said() -> None:
+    """docs/pytest.md: as the table of words has it."""
+    exo = rig()
+    exo.send(0x123, b"\x01")
+    exo.expect(0x123, within="1 ms", bus="drive")
+    assert [row.bus for row in exo.rows if row.frame.can_id == 0x123] == [0, 1]
+
+
 # ---- faults ---------------------------------------------------------------------------------------------------------
 
 
