@@ -100,6 +100,7 @@ INTERPRETED: Final = {
     "canopen_exo/dbc.py": "runs once, through cantools",
     "canopen_exo/eds.py": "runs once, through canopen",
     "canopen_exo/plan.py": "frozen dataclasses, read once",
+    "canopen_exo/talk.py": "what is printed, for people",
     "fi_gateway/*_specs.py": "files are read once, through pydantic",
     "fi_gateway/fault_specs/*.py": "files are read once, through pydantic",
     "fi_gateway/kinds.py": "files are read once, through pydantic",

@@ -13,8 +13,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from canopen_exo.talk import show, tell
 from testbench.cli_campaign import add_campaign_verbs
-from testbench.cli_rig import CONTROL_ADDRESS, HUB_ADDRESS, add_rig_options, add_verbs, named_buses
+from testbench.cli_rig import CONTROL_ADDRESS, HUB_ADDRESS, add_control_frames, add_rig_options, add_verbs, named_buses
 
 if TYPE_CHECKING:
     from testbench.replay import Replay
@@ -31,19 +32,21 @@ _SIM_MODULES: Final = ("mujoco", "matplotlib", "pyarrow")
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one verb; returns the exit code."""
+    if sys.stderr is None:  # closed by whoever started it
+        sys.stderr = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115 - for as long as the process lives
     options = _parser().parse_args(arguments)
     verb: Callable[[argparse.Namespace], int] = options.verb
     try:
         return verb(options)
     except (KeyboardInterrupt, Exception) as error:  # noqa: BLE001 - the last resort: exit 1 would read as a verdict
         if _is_interrupt(error):
-            _say("interrupted")
+            tell("interrupted")
             return INTERRUPTED
         if isinstance(error, ModuleNotFoundError) and (error.name or "").partition(".")[0] in _SIM_MODULES:
-            _say(f"{error.name} is not installed; a run needs the extra sim: pip install 'exo-hil[sim]'")
+            tell(f"{error.name} is not installed; a run needs the extra sim: pip install 'exo-hil[sim]'")
             return USAGE
-        traceback.print_exc()
-        _say("exo-hil: this is a defect of the program; nothing about the scenario is proved")
+        tell(traceback.format_exc().rstrip())
+        tell("exo-hil: this is a defect of the program; nothing about the scenario is proved")
         return INVALID
 
 
@@ -79,6 +82,7 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("--json", action="store_true", help="print the result as one JSON document")
     run.add_argument("--realtime", action="store_true", help="as processes against the clock, not in virtual time")
     add_rig_options(run)
+    add_control_frames(run)
     run.set_defaults(verb=_run)
 
     check = verbs.add_parser("check", help="validate a scenario and say what it will do", description=_check.__doc__)
@@ -87,7 +91,7 @@ def _parser() -> argparse.ArgumentParser:
     check.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="overrides", help="as for run")
     check.set_defaults(verb=_check)
 
-    add_campaign_verbs(verbs, _print)
+    add_campaign_verbs(verbs, show)
     add_verbs(verbs)
 
     export = verbs.add_parser("export", help="write files for other tools", description=_export.__doc__)
@@ -108,7 +112,7 @@ class _Version(argparse.Action):
     ) -> None:
         from importlib.metadata import version
 
-        print(f"exo-hil {version('exo-hil')}")
+        show(f"exo-hil {version('exo-hil')}\n")
         parser.exit()
 
 
@@ -129,9 +133,11 @@ def _run(options: argparse.Namespace) -> int:
         scenario, replay = _loaded(options)
         buses = _real_time_buses(options)
         if options.realtime:
+            from testbench.gateway_process import check_control_frames
             from testbench.realtime_run import check_without
             from testbench.scenario import refuse_queues
 
+            check_control_frames(options.control_frames, options.without, is_judged=True)
             check_without(scenario, frozenset(options.without))
             refuse_wire_faults(scenario.injectors, "exo-hil run --realtime")
             refuse_queues(scenario, "exo-hil run --realtime")
@@ -139,10 +145,10 @@ def _run(options: argparse.Namespace) -> int:
         folder = options.out or default_folder(scenario.name, scenario.seed, changes)
         check_folder(folder, scenario.name)
     except (FileErrors, BenchError, FaultError) as error:
-        _say(_as_typed(error, options))
+        tell(_as_typed(error, options))
         return USAGE
     for warning in scenario.warnings:
-        _say(f"warning: {warning}")
+        tell(f"warning: {warning}")
 
     from canopen_exo.errors import CanopenExoError
     from joint_emulators.errors import JointEmulatorError
@@ -156,33 +162,40 @@ def _run(options: argparse.Namespace) -> int:
                 without = frozenset(options.without)
                 places = _places(options, without)
                 result = run_realtime(
-                    scenario, buses, without, fifo=options.fifo, places=places, progress=progress, announce=_say
+                    scenario,
+                    buses,
+                    without,
+                    fifo=options.fifo,
+                    places=places,
+                    control_frames=options.control_frames,
+                    progress=progress,
+                    announce=tell,
                 )
             else:
                 from testbench.run import run_scenario
 
                 result = run_scenario(scenario, progress, None if replay is None else replay.windows)
     except RefusedError as error:
-        _say(str(error))
+        tell(str(error))
         return USAGE
     except (BenchError, JointEmulatorError, CanopenExoError) as error:
-        _say(f"{scenario.name}: run invalid: {error}")
+        tell(f"{scenario.name}: run invalid: {error}")
         return INVALID
     if replay is not None:
         result.document["replay"] = replay.entry(result.document)
     try:
         written = write_folder(folder, result)
     except BenchError as error:
-        _say(str(error))
+        tell(str(error))
         return USAGE
-    _print(summary_json(result.document) if options.json else summary_text(result.document))
-    _say(f"result folder: {written}")
+    show(summary_json(result.document) if options.json else summary_text(result.document))
+    tell(f"result folder: {written}")
     if not result.document["valid"]:
         timing = result.document.get("realtime")
         if timing is not None and timing["late_cycles"]:
             from testbench.watch import too_busy
 
-            _say(too_busy(scenario.plan.cycle_ns))
+            tell(too_busy(scenario.plan.cycle_ns))
         return INVALID
     return PASS if result.judgement.passed else FAIL
 
@@ -226,7 +239,7 @@ def _real_time_buses(options: argparse.Namespace) -> tuple[str, str] | None:
     from testbench.errors import BenchError
 
     buses = named_buses(options)
-    of_real_time = ("controller_bus", "drive_bus", "without", "listen", "control", "fifo")
+    of_real_time = ("controller_bus", "drive_bus", "without", "listen", "control", "control_frames", "fifo")
     given = [f"--{name.replace('_', '-')}" for name in of_real_time if getattr(options, name)]
     if given and not options.realtime:
         raise BenchError(f"{', '.join(given)}: {'is' if len(given) == 1 else 'are'} of real time; add --realtime")
@@ -246,14 +259,14 @@ def _check(options: argparse.Namespace) -> int:
         overrides.append(f"seed={options.seed}")
     try:
         if is_campaign_file(options.scenario):
-            return check_campaign(options.scenario, options.overrides, options.seed, _print)
+            return check_campaign(options.scenario, options.overrides, options.seed, show)
         found = load_any(options.scenario, overrides)
     except FileErrors as error:
-        _say(_as_typed(error, options))
+        tell(_as_typed(error, options))
         return USAGE
-    _print("\n".join(describe_faults(found) if isinstance(found, FaultFile) else describe(found)) + "\n")
+    show("\n".join(describe_faults(found) if isinstance(found, FaultFile) else describe(found)) + "\n")
     for warning in found.warnings:
-        _say(f"warning: {warning}")
+        tell(f"warning: {warning}")
     return PASS
 
 
@@ -264,12 +277,12 @@ def _export(options: argparse.Namespace) -> int:
 
         from testbench.scenario import scenario_schema
 
-        _print(json.dumps(scenario_schema(), indent=2) + "\n")
+        show(json.dumps(scenario_schema(), indent=2) + "\n")
         return PASS
     from importlib.resources import files
 
     name = {"eds": "exo_joint.eds", "dbc": "exo.dbc"}[options.what]
-    _print((files("dbc") / name).read_text(encoding="utf-8"))
+    show((files("dbc") / name).read_text(encoding="utf-8"))
     return PASS
 
 
@@ -289,25 +302,9 @@ def _progress(name: str) -> Iterator[Callable[[float], None]]:
         yield lambda share: bar.update(task, completed=share)
 
 
-def _print(text: str) -> None:
-    """The result, to stdout. A reader that has left (`| head`) changes nothing about the exit code."""
-    try:
-        sys.stdout.write(text)
-        sys.stdout.flush()
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    except OSError as error:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        _say(f"stdout: {error.strerror or error}; the result could not be printed there")
-
-
 def _as_typed(error: Exception, options: argparse.Namespace) -> str:
     """A complaint in the words of the command line: the seed came as --seed."""
     return str(error) if options.seed is None else str(error).replace("--set seed=", "--seed ")
-
-
-def _say(text: str) -> None:
-    print(text, file=sys.stderr)
 
 
 if __name__ == "__main__":

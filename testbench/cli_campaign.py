@@ -14,6 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from canopen_exo.talk import tell
 from testbench.cli_rig import HUB_ADDRESS, INVALID, PASS, USAGE, Verbs, add_rig_options, named_buses
 from testbench.errors import BenchError
 
@@ -96,7 +97,7 @@ def check_campaign(path: Path, overrides: list[str], seed: str | None, show: Cal
     from testbench.campaign.words import describe_campaign
 
     if seed is not None:
-        _say(f"--seed {seed}: a campaign has one seed for all its runs, in its file; leave the option out")
+        tell(f"--seed {seed}: a campaign has one seed for all its runs, in its file; leave the option out")
         return USAGE
     show("\n".join(describe_campaign(load_campaign(path, overrides))) + "\n")
     return PASS
@@ -127,7 +128,7 @@ def _told(
         try:
             return verb(options, show)
         except (BenchError, FaultError) as error:
-            _say(str(error))
+            tell(str(error))
             return USAGE
 
     return told
@@ -170,7 +171,7 @@ def _run(options: argparse.Namespace, show: Callable[[str], None]) -> int:
         rows = store.runs.all(brief=True)
         show(_run_json(campaign, store, rows, finished) if options.json else _run_text(campaign, store, rows, finished))
         if finished.interrupted:
-            _say(f"interrupted; the same command goes on from here: {len(rows)} runs are in {path}")
+            tell(f"interrupted; the same command goes on from here: {len(rows)} runs are in {path}")
             return INTERRUPTED
         if not options.no_report:
             _write_report(store, None, None)
@@ -233,7 +234,7 @@ def _stopping(orders: "Orders") -> Callable[[], int]:
     def count() -> int:
         if orders.count and not told:
             told.append("stopping: no run is begun any more, those in flight get 10 s; Ctrl-C again drops them")
-            _say(told[0])
+            tell(told[0])
         return orders.count
 
     return count
@@ -377,7 +378,7 @@ def _write_report(store: "Store", html: Path | None, junit: Path | None) -> None
     except OSError as error:
         reason = error.strerror or error
         raise BenchError(f"report {html}, {junit}: {reason}; the runs are safe in {store.path}") from error
-    _say(f"report: {html}, {junit}")
+    tell(f"report: {html}, {junit}")
 
 
 def _replay(options: argparse.Namespace, show: Callable[[str], None]) -> int:
@@ -387,7 +388,7 @@ def _replay(options: argparse.Namespace, show: Callable[[str], None]) -> int:
 
     store = open_store(options.store)
     try:
-        again = make_again(store, options.run, options.out, _say)
+        again = make_again(store, options.run, options.out, tell)
     finally:
         store.close()
     if options.json:
@@ -413,9 +414,5 @@ def _export(options: argparse.Namespace, show: Callable[[str], None]) -> int:
     for path, write in ((options.csv, write_csv), (options.parquet, write_parquet)):
         if path is not None:
             write(table, path)
-            _say(f"{path}: {len(next(iter(table.values()), []))} lines")
+            tell(f"{path}: {len(next(iter(table.values()), []))} lines")
     return PASS
-
-
-def _say(text: str) -> None:
-    print(text, file=sys.stderr)

@@ -4,11 +4,11 @@ Nothing heavy is imported before a verb needs it.
 """
 
 import argparse
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Protocol
 
+from canopen_exo.talk import tell
 from testbench.errors import BenchError
 
 if TYPE_CHECKING:
@@ -54,6 +54,7 @@ def add_verbs(verbs: Verbs) -> None:
     up = verbs.add_parser("up", help="the whole rig as real-time processes until Ctrl-C", description=_up.__doc__)
     _add_scenario(up)
     add_rig_options(up)
+    add_control_frames(up)
     up.add_argument("--no-faults", action="store_true", help="without the scenario's injectors")
     up.set_defaults(verb=_up)
 
@@ -86,11 +87,7 @@ def add_verbs(verbs: Verbs) -> None:
     gateway.add_argument(
         "--control", metavar="ADDRESS", default="", help=f"live control at HOST:PORT or a path: {CONTROL_ADDRESS}"
     )
-    gateway.add_argument(
-        "--control-frames",
-        metavar="SIDE[:COMMAND,STATUS]",
-        help="live control by frames on the controller or drive side, as in drive:0x6C0,0x6C1",
-    )
+    add_control_frames(gateway)
     gateway.set_defaults(verb=_gateway)
 
     fault = verbs.add_parser("fault", help="live control of a running gateway", description=_fault.__doc__)
@@ -128,6 +125,16 @@ def add_rig_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--listen", metavar="HOST:PORT", help=f"of the own hub (default: {HUB_ADDRESS} {known})")
     parser.add_argument("--control", metavar="ADDRESS", help=f"of the gateway (default: {CONTROL_ADDRESS} {known})")
     parser.add_argument("--fifo", action="store_true", help="real-time scheduling (SCHED_FIFO), where permitted")
+
+
+def add_control_frames(parser: argparse.ArgumentParser) -> None:
+    """Live control over the bus: of the gateway, and of what starts one."""
+    parser.add_argument(
+        "--control-frames",
+        metavar="SIDE[:COMMAND,STATUS]",
+        default="",
+        help="live control by frames on the controller or drive side, as in drive:0x6C0,0x6C1",
+    )
 
 
 def named_buses(options: argparse.Namespace) -> tuple[str, str] | None:
@@ -218,7 +225,7 @@ def _gateway(options: argparse.Namespace) -> int:
             return USAGE
         buses = (_bus(options.controller_bus, "controller"), _bus(options.drive_bus, "drive"))
         check_two(*buses)
-        frames = None if options.control_frames is None else control_frames(options.control_frames)
+        frames = control_frames(options.control_frames) if options.control_frames else None
         return gateway_main(faults, buses, how, GatewayOptions(not options.no_faults, options.control, frames))
 
     return _served(serve, options)
@@ -234,7 +241,7 @@ def _served(serve: Callable[["ProcessOptions"], int], options: argparse.Namespac
         given = (options.epoch, options.part, options.fifo, options.supervisor, options.folder, options.busy_poll)
         return serve(ProcessOptions(*given))
     except (BenchError, CanopenExoError, FaultError) as error:
-        print(error, file=sys.stderr)
+        tell(error)
         return USAGE
 
 
@@ -252,10 +259,10 @@ def _read_faults(options: argparse.Namespace) -> "FaultFile | None":
         else:
             faults = no_faults()
     except FileErrors as error:
-        print(error, file=sys.stderr)
+        tell(error)
         return None
     for warning in [] if options.no_faults or options.supervisor else faults.warnings:
-        print(f"warning: {warning}", file=sys.stderr)
+        tell(f"warning: {warning}")
     return faults
 
 
@@ -269,7 +276,7 @@ def read_scenario(options: argparse.Namespace) -> "Scenario | None":
             return load_scenario(options.scenario, options.overrides)
         return parse_scenario(DEFAULT_SCENARIO, "default scenario", options.overrides)
     except FileErrors as error:
-        print(error, file=sys.stderr)
+        tell(error)
         return None
 
 
@@ -297,7 +304,7 @@ def _hub(options: argparse.Namespace) -> int:
         bitrate = HUB_BITRATE if bitrate is None else bitrate
         return hub_main(options.listen, options.timed, bitrate, _bus_maker(options))
     except BenchError as error:
-        print(f"hub: {error}", file=sys.stderr)
+        tell(f"hub: {error}")
         return USAGE
     finally:
         remove_orphaned(options.folder, options.supervisor)
@@ -327,15 +334,15 @@ def _fault(options: argparse.Namespace) -> int:
 
     word, name = options.word, options.name
     if word in NAMED and not name:
-        print(f"fault {word}: which injector? `exo-hil fault list` names them", file=sys.stderr)
+        tell(f"fault {word}: which injector? `exo-hil fault list` names them")
         return USAGE
     if name and word not in NAMED:
-        print(f"fault {word}: {name!r} given, allowed is nothing: it is about the whole gateway", file=sys.stderr)
+        tell(f"fault {word}: {name!r} given, allowed is nothing: it is about the whole gateway")
         return USAGE
     try:
         return fault_main(options.word, options.name, options.at)
     except FaultError as error:
-        print(error, file=sys.stderr)
+        tell(error)
         return USAGE
 
 
@@ -345,6 +352,7 @@ def _up(options: argparse.Namespace) -> int:
     from fi_gateway.errors import FaultError
     from fi_gateway.schema import refuse_wire_faults
     from testbench.child import ProcessError
+    from testbench.gateway_process import check_control_frames
     from testbench.live import run_up
     from testbench.scenario import refuse_queues
     from testbench.supervisor import Setup
@@ -356,6 +364,7 @@ def _up(options: argparse.Namespace) -> int:
         refuse_queues(scenario, "exo-hil up")
         if not options.no_faults:
             refuse_wire_faults(scenario.injectors, "exo-hil up")
+        check_control_frames(options.control_frames, options.without, is_judged=False)
         setup = Setup(
             scenario,
             named_buses(options),
@@ -365,11 +374,12 @@ def _up(options: argparse.Namespace) -> int:
             fifo=options.fifo,
             listen=options.listen or HUB_ADDRESS,
             control=options.control or CONTROL_ADDRESS,
+            control_frames=options.control_frames,
         )
         return run_up(setup)
     except ProcessError as error:
-        print(error, file=sys.stderr)
+        tell(error)
         return INVALID
     except (BenchError, CanopenExoError, FaultError) as error:
-        print(error, file=sys.stderr)
+        tell(error)
         return USAGE

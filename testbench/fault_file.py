@@ -98,8 +98,8 @@ def load_faults(path: Path | str, overrides: Sequence[str] = ()) -> FaultFile:
 def load_any(path: Path | str, overrides: Sequence[str] = ()) -> Scenario | FaultFile:
     """Whichever of the two a file is; raises FileErrors with everything that is wrong."""
     document = load(path)
-    if isinstance(document.data, dict) and is_fault_file(document.data):
-        document.data.setdefault("rig", {})  # so that `rig.rate` can be set in a file that says nothing of it
+    if isinstance(document.data, dict):  # so that `rig.rate`, and the limits, can be set in a file without them
+        document.data.setdefault("rig" if is_fault_file(document.data) else "realtime", {})
     for override in overrides:
         apply_override(document, override)
     return _read(document) if is_fault_file(document.data) else scenario_in(document)

@@ -13,12 +13,14 @@ import hashlib
 import logging
 import socket
 import sys
+from collections.abc import Collection
 from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from canopen_exo.bus.interfaces import BusName, bus_identity
 from canopen_exo.bus.node import NEVER, SECOND
+from canopen_exo.talk import show
 from fi_gateway.bus_control import DEFAULT_COMMAND_ID, DEFAULT_STATUS_ID, BusControl
 from fi_gateway.control import (
     ARM,
@@ -37,6 +39,7 @@ from fi_gateway.control_socket import ControlServer
 from fi_gateway.errors import FaultError
 from fi_gateway.gateway import CONTROLLER_PORT, DRIVE_PORT, Gateway
 from testbench.errors import BenchError
+from testbench.pairing import is_request
 from testbench.process import DONE, INVALID, ProcessOptions, Session, say, session
 
 if TYPE_CHECKING:
@@ -169,6 +172,20 @@ def control_frames(text: str) -> ControlFrames:
     return ControlFrames(SIDES[side], command_id, status_id)
 
 
+def check_control_frames(text: str, without: Collection[str], *, is_judged: bool) -> None:
+    """Whether the gateway of a rig can take those frames; raises BenchError. is_judged: the run counts lost frames."""
+    if not text:
+        return
+    frames = control_frames(text)
+    if "gateway" in without:
+        raise BenchError(f"--control-frames {text}: our gateway reads them, and it is left out; leave out one of them")
+    if is_judged and not (is_request(frames.command_id) and is_request(frames.status_id)):
+        raise BenchError(
+            f"--control-frames {text}: COB-IDs 0x601 to 0x6FF are allowed in a run that is judged; others would count "
+            "as frames lost in the gateway"
+        )
+
+
 def fault_main(word: str, name: str, address: str) -> int:
     """`exo-hil fault`: one call of a running gateway's live control. Raises FaultError."""
     from fi_gateway.control import WORDS
@@ -176,9 +193,9 @@ def fault_main(word: str, name: str, address: str) -> int:
 
     if word in WORDS:
         done = ask(address, word, name).get("done") is True
-        sys.stdout.write((_DONE[word] if done else _IGNORED).format(name=name) + "\n")
+        show((_DONE[word] if done else _IGNORED).format(name=name) + "\n")
     else:
-        sys.stdout.write(ask_listing(address).text() + "\n")
+        show(ask_listing(address).text() + "\n")
     return DONE
 
 

@@ -3,6 +3,7 @@
 import sys
 from typing import Final
 
+from canopen_exo.talk import tell
 from testbench.child import ProcessError
 from testbench.gateway_process import active_faults
 from testbench.status import StatusLine
@@ -18,18 +19,21 @@ def run_up(setup: Setup) -> int:
 
     is_over = False
 
-    def say(text: str) -> None:
+    def announce(text: str) -> None:
         if line is not None:
             line.clear()
+        tell(text)
+
+    def say(text: str) -> None:
         if not is_over:
-            print(text, file=sys.stderr, flush=True)
+            announce(text)
 
     def show(now: int) -> None:
         if line is not None:
             line.show(now)
 
     try:
-        with Supervisor(setup, say, show, announce=say) as rig:
+        with Supervisor(setup, say, show, announce=announce) as rig:
             rig.start()
             for what, bus in zip(("controller bus", "drive bus"), rig.buses, strict=True):
                 say(f"{what}: {bus}")
@@ -46,5 +50,5 @@ def run_up(setup: Setup) -> int:
     except KeyboardInterrupt:
         if line is not None:
             line.clear()
-        print("stopped", file=sys.stderr)
+        tell("stopped")
     return PASS

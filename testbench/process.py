@@ -27,6 +27,7 @@ from canopen_exo.bus.node import MS, NEVER, SECOND, Node
 from canopen_exo.bus.realtime import RealTimeLoop
 from canopen_exo.bus.scheduling import release_fifo, request_fifo
 from canopen_exo.errors import CanopenExoError
+from canopen_exo.talk import tell
 from testbench.errors import BenchError, RefusedError
 
 if TYPE_CHECKING:  # numpy, and with it everything heavy
@@ -182,16 +183,25 @@ class Session:
                     found[what] = count
         return found
 
-    def _warn(self) -> None:
-        """The first time each kind of loss shows."""
+    def _counts(self) -> dict[str, int]:
+        """What was lost, and what could not be read, in words -> frames."""
         found = self.losses()
         for channel in self._channels:
             if channel.malformed:
                 found[f"unreadable from {channel.name}"] = channel.malformed
-        for what, count in found.items():
+        return found
+
+    def _warn(self) -> None:
+        """The first time each kind of loss shows."""
+        for what, count in self._counts().items():
             if what not in self._told:
                 self._told.add(what)
                 say(self.name, f"warning: {count} frames {what}; counted from now on, told at the end")
+
+    def sum_up(self) -> None:
+        """Say what was lost, at the end."""
+        for what, count in self._counts().items():
+            say(self.name, f"{count} frames {what}")
 
     def service(self) -> "Service":
         """How it was served, for its part."""
@@ -244,6 +254,7 @@ def joints_main(scenario: "Scenario", bus: BusName, options: ProcessOptions) -> 
         process.run(over)
         if options.part is not None:
             _leave_joints(options.part, process, rack)
+        process.sum_up()
     return DONE
 
 
@@ -276,6 +287,7 @@ def hlc_main(scenario: "Scenario", bus: BusName, options: ProcessOptions, endles
         process.run(over)
         if options.part is not None:
             _leave_hlc(options.part, process, controller)
+        process.sum_up()
         asked = process.orders.count > 0
     for event in controller.events:
         say("hlc", f"{event.joint or 'rig'}: {event.text}")
@@ -349,4 +361,4 @@ def remove_orphaned(folder: Path | None, supervisor: int, is_hung_up: bool = Fal
 
 def say(name: str, text: str) -> None:
     """One line of talk, to stderr."""
-    print(f"{name}: {text}", file=sys.stderr, flush=True)
+    tell(f"{name}: {text}")

@@ -53,19 +53,31 @@ def run_realtime(
     *,
     fifo: bool = False,
     places: tuple[str, str] = ("127.0.0.1:0", ""),
+    control_frames: str = "",
     progress: Progress = lambda share: None,
     announce: Callable[[str], None] = lambda text: None,
 ) -> Result:
     """Golden run, faulted run, verdict. buses: controller and drive bus, None for an own hub; without: foreign parts.
 
-    places: where own hub and live control listen, see Setup; announce: told what foreign software is waited for.
+    places: where own hub and live control listen; control_frames: see Setup for both;
+    announce: told what foreign software is waited for.
     Raises BenchError when a run gives nothing to judge: a process died, a part is missing, the motion never began;
     RefusedError when there is no run, because an address or a bus cannot be had.
     """
     check_without(scenario, without)
     started = time.perf_counter()
     listen, control = places
-    setup = Setup(scenario, buses, without, faults=False, keep_parts=True, fifo=fifo, listen=listen, control=control)
+    setup = Setup(
+        scenario,
+        buses,
+        without,
+        faults=False,
+        keep_parts=True,
+        fifo=fifo,
+        listen=listen,
+        control=control,
+        control_frames=control_frames,
+    )
     if without and buses is None:  # one hub for both runs, so that foreign software stays on its buses
         with Supervisor(setup) as host:
             host.start_hub()

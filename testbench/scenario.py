@@ -236,17 +236,23 @@ class Scenario(SpecModel):
 def load_scenario(path: Path | str, overrides: Sequence[str] = ()) -> Scenario:
     """The scenario in a file, with `key=value` overrides on top; raises FileErrors with everything that is wrong."""
     document = load(path)
-    for override in overrides:
-        apply_override(document, override)
+    _change(document, overrides)
     return scenario_in(document)
 
 
 def parse_scenario(text: str, source: str = "scenario", overrides: Sequence[str] = ()) -> Scenario:
     """As load_scenario, from text; `source` stands for the path in messages."""
     document = parse(text, source)
+    _change(document, overrides)
+    return scenario_in(document)
+
+
+def _change(document: Document, overrides: Sequence[str]) -> None:
+    """Put `key=value` overrides on top of a scenario; problems go to the document."""
+    if isinstance(document.data, dict):
+        document.data.setdefault("realtime", {})  # so that its limits can be set in a file that says nothing of them
     for override in overrides:
         apply_override(document, override)
-    return scenario_in(document)
 
 
 def scenario_schema() -> dict[str, Data]:

@@ -1,6 +1,6 @@
 """The live status line of a running rig: one line, rewritten in place, on a terminal only.
 
-What the terminal is too narrow for is cut off, lateness first: a line that wraps could not be rewritten.
+What the terminal is too narrow for is cut off, names of faults first: a line that wraps could not be rewritten.
 """
 
 import os
@@ -9,6 +9,7 @@ from typing import Final, TextIO, final
 
 from canopen_exo.bus.node import MS, NEVER, ErrorState
 from canopen_exo.plan import STATUS_MOTION, STATUS_STARTING, STATUS_STOPPED
+from canopen_exo.talk import put
 from testbench.watch import Watch, states_text
 
 EVERY_NS: Final = 250 * MS
@@ -33,8 +34,7 @@ class StatusLine:
         """Rewrite the line when it is time."""
         if not self._is_on or now < self._next_ns:
             return
-        self._stream.write(f"\r\x1b[K{_cut(self.text(now), self._width())}")
-        self._stream.flush()
+        put(self._stream, f"\r\x1b[K{_cut(self.text(now), self._width())}")
         self._next_ns = now + EVERY_NS
 
     def _width(self) -> int:
@@ -47,8 +47,7 @@ class StatusLine:
     def clear(self) -> None:
         """Make room for another line."""
         if self._is_on:
-            self._stream.write("\r\x1b[K")
-            self._stream.flush()
+            put(self._stream, "\r\x1b[K")
             self._next_ns = -NEVER
 
     def text(self, now: int) -> str:
@@ -61,17 +60,17 @@ class StatusLine:
         ]
         self._bits, self._shown_ns = list(watch.bits), now
         parts = [f"{_MOTION.get(watch.motion, 'unknown')} {_since(watch, now)}".rstrip()]
-        faults = self._faults()
-        if faults:
-            parts.append(f"faults: {', '.join(faults)}")
         for name, state in zip(("controller bus", "drive bus"), watch.ports, strict=True):
             if state is not ErrorState.ERROR_ACTIVE:
                 parts.append(f"{name} {state.value.replace('_', ' ')}")
         parts += [
-            f"drives: {states_text(watch.states.values())}",
-            f"load {loads[0]:.0f} %, {loads[1]:.0f} %",
-            f"late {watch.late} of {watch.cycles} cycles, SYNC off by at most {watch.worst_ns / 1e6:.1f} ms",
+            states_text(watch.states.values()).replace("operation enabled", "enabled"),
+            f"load {loads[0]:.0f}, {loads[1]:.0f} %",
+            f"late {watch.late}/{watch.cycles}, {watch.offsets.worst_ns / 1e6:.1f} ms",
         ]
+        faults = self._faults()
+        if faults:
+            parts.append(f"{len(faults)} {'fault' if len(faults) == 1 else 'faults'}: {', '.join(faults)}")
         return " | ".join(parts)
 
 
@@ -81,4 +80,6 @@ def _since(watch: Watch, now: int) -> str:
 
 def _cut(text: str, width: int) -> str:
     """The text in less than `width` columns, so that the cursor stays in its line."""
-    return text[: width - 1] if width else text
+    if not width or len(text) < width:
+        return text
+    return text[: max(width - 4, 0)] + "..."[: width - 1]

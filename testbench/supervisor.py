@@ -66,7 +66,8 @@ class Setup:
 
     faults: with the scenario's injectors; endless: walk until stopped; keep_parts: have each process leave its part;
     record: keep `rows`; listen: HOST:PORT of an own hub, port 0 for a free one; control: address of the gateway's live
-    control, "" for a Unix socket in the rig's folder (where there are such sockets).
+    control, "" for a Unix socket in the rig's folder (where there are such sockets); control_frames: as the option of
+    `exo-hil gateway`, "" for none.
     """
 
     scenario: Scenario
@@ -79,6 +80,7 @@ class Setup:
     fifo: bool = False
     listen: str = "127.0.0.1:0"
     control: str = ""
+    control_frames: str = ""
 
 
 def check_status_readers(setup: Setup) -> None:
@@ -98,7 +100,8 @@ class Supervisor:
     watch: the listener on both buses; processes: by name.
     say: told each line that a process prints, which its obituary then leaves out;
     tick: called with the loop's time at least every 50 ms;
-    announce: told what foreign software is waited for, and where; hub: of another supervisor, watched and not ended.
+    announce: told what foreign software is waited for, and where, and who had to be killed;
+    hub: of another supervisor, watched and not ended.
     """
 
     def __init__(
@@ -195,7 +198,10 @@ class Supervisor:
             self._mourn(dead)
 
     def stop(self) -> None:
-        """End all that runs in order: controller, gateway, joints, hub. A second interrupt kills."""
+        """End all that runs in order: controller, gateway, joints, hub. One that does not in time is killed and named.
+
+        A second interrupt kills.
+        """
         before = self.orders.count
         for name in ("hlc", "gateway", "joints", "hub"):
             process = self.processes.get(name)
@@ -208,6 +214,10 @@ class Supervisor:
             while process.code is None and self.now() < limit and self.orders.count <= before:
                 self._idle(process)
             if process.code is None:
+                why = "was not waited for" if self.orders.count > before else f"did not end in {END_NS / SECOND:g} s"
+                self._announce(f"{name} {why} and was killed")
+                if self._loop is not None:
+                    self._loop.remove_reader(process)
                 process.close()
 
     # --- what it knows -------------------------------------------------------------------------------------------
@@ -266,6 +276,8 @@ class Supervisor:
             arguments = ["--controller-bus", controller_bus, "--drive-bus", drive_bus, *self._common("gateway")]
             if self.control_address:
                 arguments += ["--control", self.control_address]
+            if self.setup.control_frames:
+                arguments += ["--control-frames", self.setup.control_frames]
             self._spawn("gateway", [*arguments, *([] if self.setup.faults else ["--no-faults"])])
         else:
             both = f"{controller_bus} and {drive_bus}"

@@ -11,6 +11,7 @@ from typing import Final, final
 
 from canopen_exo import plan as ids
 from canopen_exo.bus.frame import Frame
+from canopen_exo.bus.lateness import Lateness
 from canopen_exo.bus.node import MS, NEVER, ErrorState, Node, Out, PortState
 from canopen_exo.cia402 import DriveState, decode_statusword
 from canopen_exo.emcy import HEARTBEAT_LOST, RPDO_TIMEOUT, SYNC_LOST, error_words
@@ -58,7 +59,7 @@ class Watch(Node):
     the controller's status frame, NEVER before it; motion: last state in that frame; phase: of the stride, 0..1.
     ended_by: the error after which the controller ended the motion, in words, "" for none.
     cycles, late: SYNCs on the controller bus since answers and commands were first complete, and those before whose
-    successor they were not; worst_ns: largest difference between a SYNC's distance to the one before and the cycle.
+    successor they were not; offsets: how much a SYNC's distance to the one before differed from the cycle.
     ports: state of both interfaces; bits: by port, carried so far.
     """
 
@@ -75,7 +76,7 @@ class Watch(Node):
         self.phase: float = 0.0
         self.cycles: int = 0
         self.late: int = 0
-        self.worst_ns: int = 0
+        self.offsets: Final[Lateness] = Lateness()
         self.ports: Final[list[ErrorState]] = [ErrorState.ERROR_ACTIVE, ErrorState.ERROR_ACTIVE]
         self.bits: Final[list[int]] = [0, 0]
         self._names: Final[dict[int, str]] = {joint.node_id: joint.name for joint in plan.joints}
@@ -116,12 +117,16 @@ class Watch(Node):
 
     def timing_words(self) -> str:
         """What was late, for people; "" for a rig that kept time: no late cycle, no SYNC off by half a cycle."""
-        if not self.late and self.worst_ns <= self.plan.cycle_ns // 2:
+        if not self.late and self.offsets.worst_ns <= self.plan.cycle_ns // 2:
             return ""
-        return (
-            f"the rig was late: {self.late} of {self.cycles} cycles, SYNC off by at most {self.worst_ns / 1e6:.1f} ms; "
-            f"{too_busy(self.plan.cycle_ns)}"
-        )
+        remedy = too_busy(self.plan.cycle_ns)
+        return f"the rig was late: {self.late} of {self.cycles} cycles, {self.sync_words()}; {remedy}"
+
+    def sync_words(self) -> str:
+        """How regular SYNC was, for people: the worst, and what half and 99 % of the cycles did not exceed."""
+        median_ns, most_ns = self.offsets.percentile(0.5), self.offsets.percentile(0.99)
+        shares = f"(50 %: {median_ns / 1e6:.1f}, 99 %: {most_ns / 1e6:.1f})"
+        return f"SYNC off by at most {self.offsets.worst_ns / 1e6:.1f} ms {shares}"
 
     # --- listening -----------------------------------------------------------------------------------------------
 
@@ -177,9 +182,7 @@ class Watch(Node):
             self.cycles += 1
             if not complete:
                 self.late += 1
-            off = abs(now - self._sync_ns - self.plan.cycle_ns)
-            if off > self.worst_ns:
-                self.worst_ns = off
+            self.offsets.add(abs(now - self._sync_ns - self.plan.cycle_ns))
         self._complete = self._complete or complete
         self._sync_ns = now
         self._answers.clear()

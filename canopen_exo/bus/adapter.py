@@ -50,6 +50,9 @@ _REFUSALS: Final = (
 )
 """What python-can's interfaces raise when they cannot be opened; the last three where a vendor's library is missing."""
 
+_HEARS_ITSELF: Final = "udp_multicast"
+"""The one interface of python-can that takes what it sent itself as received, with nothing to tell it by."""
+
 
 def to_message(frame: Frame) -> can.Message:
     """The frame as python-can has it."""
@@ -123,6 +126,11 @@ def open_python_can(interface: str, channel: str, bitrate: int | None, context: 
     if interface not in can.VALID_INTERFACES:
         known = ", ".join(sorted(can.VALID_INTERFACES))
         raise CanopenExoError(f"bus {name}: there is no interface {interface!r}; python-can has {known}")
+    if interface == _HEARS_ITSELF:
+        raise CanopenExoError(
+            f"bus {name}: {interface} hears itself, a gateway on it would pass on its own frames for ever; use `hub:`, "
+            "also from other machines (exo-hil hub --listen)"
+        )
     try:
         # a loop that hears itself answers itself: whatever python-can's configuration says, own frames stay away
         given: dict[str, Any] = {"receive_own_messages": False}

@@ -21,6 +21,7 @@ from canopen_exo.bus.hub_wire import split_address
 from canopen_exo.bus.medium import Medium
 from canopen_exo.bus.node import NEVER, SECOND
 from canopen_exo.errors import CanopenExoError
+from canopen_exo.talk import put, tell
 
 MAX_CLIENTS: Final = 256
 HELLO_NS: Final = 5 * SECOND
@@ -281,7 +282,7 @@ def hub_main(listen_on: str, timed: bool, bitrate: int, make_timed: MakeBus | No
         host, port = split_address(listen_on)
         listener = listen(host, port)
     except CanopenExoError as error:
-        print(error, file=sys.stderr, flush=True)
+        tell(error)
         return 2
     try:
         if timed:
@@ -289,14 +290,14 @@ def hub_main(listen_on: str, timed: bool, bitrate: int, make_timed: MakeBus | No
         server = HubServer(listener, bitrate if timed else 0, make_timed)
     except CanopenExoError as error:
         listener.close()
-        print(error, file=sys.stderr, flush=True)
+        tell(error)
         return 2
     with contextlib.closing(server), _signals() as stop:
         if not _is_loopback(listener):
             _say(f"warning: {server.address()} can be reached from other machines, and whoever connects is on the bus")
         if timed:
             fine_timers()
-        print(f"listening on {server.address()}", flush=True)
+        put(sys.stdout, f"listening on {server.address()}\n")
         while server.serve(stop):
             pass
     for line in report(server):
@@ -336,4 +337,4 @@ def fine_timers() -> None:
 
 
 def _say(text: str) -> None:
-    print(f"hub: {text}", file=sys.stderr, flush=True)
+    tell(f"hub: {text}")

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Final, TextIO
 
+from canopen_exo.talk import put
 from testbench.campaign.runner import Progress
 from testbench.campaign.words import counts_text, time_text
 
@@ -47,4 +48,4 @@ class _Lines:
     def tell(self, far: Progress) -> None:
         if time.monotonic() >= self._next and far.done != self._told:
             self._told, self._next = far.done, time.monotonic() + EVERY_S
-            print(f"{self._name}: {line(far)}", file=self._stream, flush=True)
+            put(self._stream, f"{self._name}: {line(far)}\n")

@@ -142,6 +142,11 @@ class Exo:
         """How well it keeps time, in words; "" where time is virtual."""
         return ""
 
+    @property
+    def lateness(self) -> str:
+        """What a run would be invalid for, in words; "" for a rig that kept time, and where time is virtual."""
+        return ""
+
     def frames(self, bus: str, last: int = 50) -> list[Transmission]:
         """The last frames of bus "controller" or "drive", oldest first."""
         index = bus_index(bus)
@@ -243,7 +248,7 @@ class Exo:
         if found is not None:
             raise AssertionError(f"{self._words(wanted)} was not to come within {within}:\n{self.text_of(found)}")
 
-    def send(self, cob_id: int, data: bytes, *, bus: str) -> None:
+    def send(self, cob_id: int, data: bytes, *, bus: str = "controller") -> None:
         """Put a frame with an 11-bit id on bus "controller" or "drive", as one more node on it."""
         self._start()
         self._send(bus_index(bus), Frame(cob_id, data))

@@ -5,7 +5,9 @@ for the fixture; without the extra `sim` only that test fails, saying so.
 """
 
 import re
+import warnings
 from collections.abc import Generator, Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -19,23 +21,36 @@ if TYPE_CHECKING:
 LOCKSTEP: Final = "lockstep"
 HUB: Final = "hub"
 VCAN: Final = "vcan"
+AUTO: Final = "auto"
+_VCAN_BUSES: Final = ("socketcan:vcan0", "socketcan:vcan1")
 PARTS: Final = ("joints", "gateway", "hlc")
 
 MARKER_KEYS: Final = ("scenario", "rate", "stops", "seed", "overrides")
+
+_BUS: Final = pytest.StashKey[str]()
+"""Where the rigs of this session run: `--exo-bus`, or what `auto` stands for."""
+
+_WHY: Final = pytest.StashKey[str]()
+"""Why `auto` stands for that; "" for a bus that was named."""
 
 _EXO: Final = pytest.StashKey["Exo"]()
 _PLACES: Final = pytest.StashKey[pytest.TempPathFactory]()
 
 
+class LateRigWarning(UserWarning):
+    """A test whose rig was later than its scenario allows a real-time run to be."""
+
+
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """`--exo-bus`, `--exo-scenario`, `--exo-set`, `--exo-without`, `--exo-fifo`."""
+    """`--exo-bus`, `--exo-scenario`, `--exo-set`, `--exo-without`, `--exo-fifo`, `--exo-control-frames`."""
     group = parser.getgroup("exo-hil", "exoskeleton rig under test (exo-hil)")
     group.addoption(
         "--exo-bus",
         default=LOCKSTEP,
         metavar="BUS",
         help="where the rig of the fixture `exo` runs: lockstep (virtual time, default), hub (processes on an emulated "
-        "bus), vcan (socketcan:vcan0,vcan1), or controller and drive bus such as socketcan:can0,socketcan:can1",
+        "bus), vcan (socketcan:vcan0,vcan1), auto (vcan where it can be opened, else hub), or controller and drive bus "
+        "such as socketcan:can0,socketcan:can1",
     )
     group.addoption(
         "--exo-scenario", metavar="FILE", help="scenario of tests whose marker names none (default: walking, no faults)"
@@ -60,6 +75,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         action="store_true",
         help="against the clock: real-time scheduling (SCHED_FIFO) for the processes of the rig, where permitted",
     )
+    group.addoption(
+        "--exo-control-frames",
+        default="",
+        metavar="SIDE[:COMMAND,STATUS]",
+        help="live control by frames on the controller or drive side of the gateway, as in drive:0x6C0,0x6C1",
+    )
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -70,13 +91,18 @@ def pytest_configure(config: pytest.Config) -> None:
         "a relative FILE is looked for beside the test",
     )
     config.addinivalue_line("markers", "requirement(id, ...): ids of the requirements that the test verifies")
-    named_buses(config.getoption("--exo-bus"))
+    bus, why = config.getoption("--exo-bus"), ""
+    if bus == AUTO:
+        bus, why = best_bus(_workers(config))
+    named_buses(bus)
+    config.stash[_BUS] = bus
+    config.stash[_WHY] = why
 
 
 def pytest_report_header(config: pytest.Config) -> list[str]:
-    """Where the rigs run, when that was chosen."""
-    bus = config.getoption("--exo-bus")
-    return [] if bus == LOCKSTEP else [f"exo-hil: bus {bus}"]
+    """Where the rigs run, when that was chosen, and why there, when that was left to the plug-in."""
+    bus, why = config.stash[_BUS], config.stash[_WHY]
+    return [] if bus == LOCKSTEP else [f"exo-hil: bus {bus}{f' (auto: {why})' if why else ''}"]
 
 
 def pytest_itemcollected(item: pytest.Item) -> None:
@@ -113,6 +139,8 @@ def exo(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
         request.node.stash[_PLACES] = tmp_path_factory
         request.node.stash[_EXO] = rig
         yield rig
+        if rig.lateness:
+            warnings.warn(LateRigWarning(rig.lateness), stacklevel=1)
 
 
 @pytest.hookimpl(wrapper=True)
@@ -143,7 +171,7 @@ def named_buses(option: str) -> tuple[str, str] | None:
     if option in (LOCKSTEP, HUB):
         return None
     if option == VCAN:
-        return "socketcan:vcan0", "socketcan:vcan1"
+        return _VCAN_BUSES
     from canopen_exo.bus.interfaces import parse_bus, same_bus
     from canopen_exo.errors import CanopenExoError
 
@@ -156,9 +184,35 @@ def named_buses(option: str) -> tuple[str, str] | None:
             raise CanopenExoError("two different buses are needed, controller and drive bus")
     except CanopenExoError as error:
         raise pytest.UsageError(
-            f"--exo-bus {option}: {error}; allowed: {LOCKSTEP}, {HUB}, {VCAN}, or two buses such as socketcan:can0,can1"
+            f"--exo-bus {option}: {error}; allowed: {LOCKSTEP}, {HUB}, {VCAN}, {AUTO}, or two buses such as "
+            "socketcan:can0,can1"
         ) from error
     return str(buses[0]), str(buses[1])
+
+
+def best_bus(workers: int) -> tuple[str, str]:
+    """What `auto` stands for on this machine, and why. workers: processes that run tests side by side."""
+    from canopen_exo.bus.interfaces import open_channel, parse_bus
+    from canopen_exo.bus.node import ErrorState
+    from canopen_exo.errors import CanopenExoError
+
+    if workers > 1:
+        return HUB, f"vcan holds one rig at a time, and {workers} processes run tests"
+    try:
+        for name in _VCAN_BUSES:
+            with closing(open_channel(parse_bus(name))) as channel:
+                for state in (arrival.state for arrival in channel.receive()):
+                    if state is not None and state.state is ErrorState.DOWN:
+                        return HUB, f"bus {name}: {state.cause}"
+    except CanopenExoError as error:
+        return HUB, str(error)
+    return VCAN, "vcan0 and vcan1 can be opened"
+
+
+def _workers(config: pytest.Config) -> int:
+    """Of pytest-xdist, in one of them and in the process that started them."""
+    started: int | None = config.getoption("numprocesses", None)
+    return int(getattr(config, "workerinput", {}).get("workercount", started or 1))
 
 
 def _open(request: pytest.FixtureRequest) -> "Exo":
@@ -166,27 +220,30 @@ def _open(request: pytest.FixtureRequest) -> "Exo":
     from canopen_exo.errors import CanopenExoError
     from fi_gateway.errors import FaultError
     from testbench.errors import BenchError
+    from testbench.gateway_process import check_control_frames
 
     config = request.config
-    bus, without = config.getoption("--exo-bus"), frozenset(config.getoption("--exo-without"))
+    bus, without = config.stash[_BUS], frozenset(config.getoption("--exo-without"))
     goldens: Goldens = request.getfixturevalue("exo_goldens")
     try:
         scenario = _scenario(request.node, config)
         buses = named_buses(bus)
-        if buses is not None and getattr(config, "workerinput", {}).get("workercount", 1) > 1:
+        if buses is not None and _workers(config) > 1:
             raise BenchError(f"--exo-bus {bus}: one rig at a time fits on it; run without -n, or with -n 1")
         if bus == HUB and without:
             raise BenchError(
                 f"--exo-without {' '.join(sorted(without))}: nobody else knows where the hub of a test is; start "
                 "`exo-hil hub --timed` and name its buses: --exo-bus hub:controller,drive"
             )
+        frames: str = config.getoption("--exo-control-frames")
+        check_control_frames(frames, without, is_judged=False)
         if bus == LOCKSTEP:
             from testbench.plugin.lockstep import open_lockstep
 
-            return open_lockstep(scenario, goldens, without)
+            return open_lockstep(scenario, goldens, without, frames)
         from testbench.plugin.realtime import RealTimeExo
 
-        return RealTimeExo(scenario, bus, buses, without, goldens, fifo=config.getoption("--exo-fifo"))
+        return RealTimeExo(scenario, bus, buses, without, goldens, config.getoption("--exo-fifo"), frames)
     except (BenchError, CanopenExoError, FaultError) as error:
         wrong = str(error)
     pytest.fail(f"exo: {wrong}", pytrace=False)  # out here, so that pytest does not show the same line as its cause

@@ -15,9 +15,11 @@ from canopen_exo.bus.loop import Loop
 from canopen_exo.bus.medium import Transmission
 from canopen_exo.bus.node import MS, NEVER, Node
 from canopen_exo.master import MasterState
+from fi_gateway.bus_control import BusControl
 from fi_gateway.control import InjectorRow, LiveControl, perform
 from fi_gateway.errors import FaultError
 from testbench.errors import BenchError
+from testbench.gateway_process import ControlFrames, control_frames
 from testbench.parts import NotedEvent
 from testbench.plugin.exo import Exo
 from testbench.plugin.golden import Goldens
@@ -32,16 +34,20 @@ NAME: Final = "lockstep"
 
 @final
 class LockStepGateway(GatewayControl):
-    """The gateway of a lock-step rig."""
+    """The gateway of a lock-step rig. frames: live control over the bus, None for none."""
 
-    def __init__(self, scenario: Scenario) -> None:
+    def __init__(self, scenario: Scenario, frames: ControlFrames | None) -> None:
         super().__init__(scenario)
+        self._frames: Final = frames
         self._loop: Loop | None = None
         self._control: LiveControl | None = None
 
     def connect(self, rig: Rig) -> None:
         """The rig is there: from now on calls reach its gateway."""
         self._loop, self._control = rig.loop, LiveControl(rig.gateway, self.additions)
+        frames = self._frames
+        if frames is not None:
+            rig.gateway.attach(BusControl(self._control, frames.port, frames.command_id, frames.status_id))
 
     def listing(self) -> list[InjectorRow]:
         """As they are now; empty before the rig runs."""
@@ -64,8 +70,8 @@ class LockStepGateway(GatewayControl):
 class LockStepExo(Exo):
     """A rig in virtual time."""
 
-    def __init__(self, scenario: Scenario, goldens: Goldens) -> None:
-        self._injectors: Final = LockStepGateway(scenario)
+    def __init__(self, scenario: Scenario, goldens: Goldens, frames: ControlFrames | None = None) -> None:
+        self._injectors: Final = LockStepGateway(scenario, frames)
         super().__init__(scenario, NAME, self._injectors, goldens)
         self._rig: Rig | None = None
         self._heard: int = 0
@@ -149,9 +155,9 @@ def _next_instant(rig: Rig) -> int:
     return at if at > rig.loop.now else rig.loop.now + 1
 
 
-def open_lockstep(scenario: Scenario, goldens: Goldens, without: frozenset[str]) -> LockStepExo:
-    """A rig in virtual time; raises BenchError when a part is to be foreign."""
+def open_lockstep(scenario: Scenario, goldens: Goldens, without: frozenset[str], frames: str = "") -> LockStepExo:
+    """A rig in virtual time; raises BenchError when a part is to be foreign. frames: as `gateway --control-frames`."""
     if without:
         parts = ", ".join(sorted(without))
         raise BenchError(f"--exo-without {parts}: in lock-step no part is foreign; name a bus with --exo-bus")
-    return LockStepExo(scenario, goldens)
+    return LockStepExo(scenario, goldens, control_frames(frames) if frames else None)

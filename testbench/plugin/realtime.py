@@ -89,7 +89,7 @@ class RealTimeGateway(GatewayControl):
 
 @final
 class RealTimeExo(Exo):
-    """A rig of processes. buses: of controller and drives, None for an own hub; without, fifo: as Setup."""
+    """A rig of processes. buses: of controller and drives, None for an own hub; the rest: as Setup."""
 
     def __init__(
         self,
@@ -99,10 +99,13 @@ class RealTimeExo(Exo):
         without: frozenset[str],
         goldens: Goldens,
         fifo: bool = False,
+        control_frames: str = "",
     ) -> None:
         self._injectors: Final = RealTimeGateway(scenario)
         super().__init__(scenario, bus, self._injectors, goldens)
-        self._setup: Final[Setup] = Setup(scenario, buses, without, record=True, fifo=fifo)
+        self._setup: Final[Setup] = Setup(
+            scenario, buses, without, record=True, fifo=fifo, control_frames=control_frames
+        )
         self._stack: Final = contextlib.ExitStack()
         self._rig: Supervisor | None = None
         self._rows: list[Transmission] = []
@@ -135,10 +138,24 @@ class RealTimeExo(Exo):
         if rig is None:
             return ""
         watch = rig.watch
-        return (
-            f"timing: {watch.late} of {watch.cycles} cycles late, SYNC off by at most {watch.worst_ns / 1e6:.1f} ms; "
-            f"{rig.missed} frames not heard"
-        )
+        late = f"{watch.late} of {watch.cycles} cycles late"
+        return f"timing: {late}, {watch.sync_words()}; {rig.missed} frames not heard"
+
+    @property
+    def lateness(self) -> str:
+        """Beyond the limits of the scenario, as far as the supervisor hears it.
+
+        Answers may also be late or missing because of a fault: cycles are judged where none has acted, SYNC always.
+        """
+        rig, limits = self._rig, self.scenario.realtime
+        if rig is None:
+            return ""
+        watch = rig.watch
+        is_late = watch.late > limits.late_share * watch.cycles and not self._has_acted()
+        if not is_late and watch.offsets.worst_ns <= limits.late_worst_ns:
+            return ""
+        allowed = f"allowed {100 * limits.late_share:g} %, {limits.late_worst_ns / 1e6:g} ms"
+        return f"the rig was late, {allowed}: {self.timing.removeprefix('timing: ')}"
 
     def close(self) -> None:
         """Stop all processes in order."""
@@ -146,6 +163,13 @@ class RealTimeExo(Exo):
             channel.close()
         self._senders.clear()
         self._stack.close()
+
+    def _has_acted(self) -> bool:
+        """Whether a fault has, or may have."""
+        try:
+            return any(row.activated for row in self._injectors.listing())
+        except FaultError:  # the gateway is gone
+            return True
 
     def _start(self) -> None:
         if self._rig is None:

@@ -7,7 +7,7 @@ import re
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Final, TypeVar, final
+from typing import Any, Final, TypeVar, final
 
 import pytest
 
@@ -23,7 +23,7 @@ BUSY: Final = "this machine is too busy for real time"
 """How the reason of such a skip begins; the count at the end of `make test` goes by it."""
 
 _TIMING: Final = re.compile(
-    r"timing: (\d+) of (\d+) cycles late, SYNC off by at most ([\d.]+) ms; (\d+) frames not heard"
+    r"timing: (\d+) of (\d+) cycles late, SYNC off by at most ([\d.]+) ms \(.*\); (\d+) frames not heard"
 )
 
 _LATE: Final = (
@@ -86,6 +86,18 @@ class Patience:
 def distributions(lateness: Mapping[str, Lateness]) -> str:
     """By name, in words, for the reason of a skip."""
     return ", ".join(f"{name}: {one.words()}" for name, one in lateness.items() if one.count)
+
+
+def why_invalid(document: Mapping[str, Any]) -> str:
+    """The reasons in a result document, and how late each process served its wake-ups; "" when there is none."""
+    if not document:
+        return ""
+    late = {
+        f"{run}, {name}": Lateness.from_document(one)
+        for run in ("golden", "faulted")
+        for name, one in document["realtime"][run]["lateness"].items()
+    }
+    return f"{', '.join(document['invalid_reasons'])}; {distributions(late)}"
 
 
 def is_lateness(reasons: list[str], cycle_ms: float) -> bool:

@@ -67,12 +67,13 @@ def walk(rig: Supervisor, for_ns: int = 300 * MS) -> Late | None:
     except ProcessError as error:
         if hlc.code != ENDED_EARLY or not gave_up_late(str(error)):
             raise
-        return Late(str(error))  # it gave up and says why: drives that miss SYNC for five cycles stop
+        # it gave up and says why: drives that miss SYNC for five cycles stop
+        return Late(f"{error}; {rig.watch.sync_words()}")
     if hlc.code is None and rig.watch.time_zero != NEVER:
         return None
     why = f"the motion did not go on: {hlc.obituary()}; {rig.watch.timing_words()}"
     assert gave_up_late(why), why
-    return Late(why)
+    return Late(f"{why}; {rig.watch.sync_words()}")
 
 
 def heard(rig: Supervisor, condition: Callable[[], bool]) -> Late | None:
@@ -85,7 +86,7 @@ def heard(rig: Supervisor, condition: Callable[[], bool]) -> Late | None:
     codes = sorted({f"{one.code:04X}" for one in rig.watch.alarms})
     words = rig.watch.timing_words()
     assert words or not rig.watch.cycles, f"drives missed SYNC or commands ({codes}) in a rig that kept time"
-    return Late(f"drives missed SYNC or commands: {codes}; {words}")
+    return Late(f"drives missed SYNC or commands: {codes}; {words or rig.watch.sync_words()}")
 
 
 def _stopped(rig: Supervisor) -> bool:

@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 from testbench.cli import main
-from tests.parity.patience import Late, Patience, is_lateness
+from tests.parity.patience import Late, Patience, is_lateness, why_invalid
 from tests.testbench.foreign import Drives
 
 pytestmark = pytest.mark.realtime
@@ -95,7 +95,7 @@ def late_or(outcome: Outcome) -> Outcome | Late:
     reasons = outcome.document.get("invalid_reasons") or outcome.said[-1:]
     # a foreign program that says so itself was not served in time either
     assert is_lateness(reasons, CYCLE_MS) or "NotInTimeError" in outcome.foreign, outcome
-    return Late("; ".join(map(str, reasons)))
+    return Late(why_invalid(outcome.document) or "; ".join(outcome.said))
 
 
 # --- foreign controller ----------------------------------------------------------------------------------------------

@@ -392,6 +392,30 @@ def test_gateway_says_by_direction_what_was_lost_and_when_an_interface_was_off(
     assert "gateway: drive side: bus off at -1.500 s: bus-off" in said
 
 
+@pytest.mark.parametrize("name", ["joints", "hlc"])
+def test_drives_and_controller_say_at_their_end_what_was_lost(
+    name: str,
+    scenario: Scenario,
+    channels: list[DeadChannel],
+    signalled: Iterator[list[int]],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As the warning promises when the first frame of a kind is lost, whether a part is left or not."""
+    next(signalled).append(signal.SIGTERM)
+    monkeypatch.setattr(DeadChannel, "__init__", dead_with_losses(DeadChannel.__init__))
+    bus = parse_bus("virtual:x")
+    if name == "joints":
+        joints_main(scenario, bus, ProcessOptions())
+    else:
+        hlc_main(scenario, bus, ProcessOptions(), endless=False)
+    assert [line for line in capsys.readouterr().err.splitlines() if "frames" in line and "warning" not in line] == [
+        f"{name}: 2 frames dropped by virtual:x before they were read",
+        f"{name}: 3 frames not taken by virtual:x",
+        f"{name}: 1 frames unreadable from virtual:x",
+    ]
+
+
 def dead_with_losses(begin: Callable[[DeadChannel, str], None]) -> Callable[[DeadChannel, str], None]:
     """A channel that has lost frames already."""
 
@@ -488,6 +512,10 @@ def test_section_of_can_conf_reaches_the_interface(
         (["gateway", "--controller-bus", "hub:a", "--drive-bus", "hub:a"], "round for ever"),
         (["gateway", "--control-frames", "middle"], "controller or drive"),
         (["gateway", "--control-frames", "drive:1,0x900"], "allowed 0x1..0x7ff"),
+        (["up", "--control-frames", "middle"], "controller or drive"),
+        (["up", "--control-frames", "drive", "--without", "gateway"], "our gateway reads them, and it is left out"),
+        (["run", "x.yaml", "--control-frames", "drive"], "--control-frames: is of real time; add --realtime"),
+        (["run", "x.yaml", "--realtime", "--control-frames", "drive:0x123,0x124"], "allowed in a run that is judged"),
         (["gateway", "missing.yaml"], "missing.yaml"),
         (["fault", "trigger"], "which injector?"),
         (["fault", "list", "x"], "'x' given, allowed is nothing"),

@@ -10,7 +10,11 @@ import can
 import pytest
 
 import testbench.plugin.lockstep  # noqa: F401 (an inner run must not be the first to load MuJoCo: it unloads its modules)
-from testbench.plugin.hooks import named_buses
+from canopen_exo.bus.channel import Arrival, Channel
+from canopen_exo.bus.interfaces import BusName
+from canopen_exo.bus.node import ErrorState, PortState
+from canopen_exo.errors import CanopenExoError
+from testbench.plugin.hooks import best_bus, named_buses
 from tests.parity.patience import Late, Patience, told_late
 
 pytest_plugins = ["pytester"]
@@ -203,7 +207,8 @@ def test_a_bus_that_is_none_ends_the_run_before_any_test(pytester: pytest.Pytest
     pytester.makepyfile("def test_other(): pass")
     result = run(pytester, f"--exo-bus={option}")
     assert result.ret == pytest.ExitCode.USAGE_ERROR
-    result.stderr.fnmatch_lines([f"ERROR: --exo-bus {option}: *allowed: lockstep, hub, vcan, or two buses such as*"])
+    allowed = "lockstep, hub, vcan, auto, or two buses such as"
+    result.stderr.fnmatch_lines([f"ERROR: --exo-bus {option}: *allowed: {allowed}*"])
 
 
 def test_where_the_rigs_run_is_said_only_when_it_was_chosen(pytester: pytest.Pytester) -> None:
@@ -211,6 +216,50 @@ def test_where_the_rigs_run_is_said_only_when_it_was_chosen(pytester: pytest.Pyt
     pytester.makepyfile("def test_other(): pass")
     run(pytester).stdout.no_fnmatch_line("*exo*hil*bus*")
     run(pytester, "--exo-bus=hub").stdout.fnmatch_lines(["exo-hil: bus hub"])
+
+
+@pytest.mark.parametrize(
+    ("missing", "down", "workers", "bus", "why"),
+    [
+        ("", "", 1, "vcan", "vcan0 and vcan1 can be opened"),
+        ("vcan1", "", 1, "hub", "there is no vcan1"),
+        ("", "vcan0", 1, "hub", "bus socketcan:vcan0: Network is down"),
+        ("", "", 2, "hub", "vcan holds one rig at a time, and 2 processes run tests"),
+    ],
+)
+def test_auto_is_vcan_where_that_can_be_opened_else_the_hub(
+    missing: str, down: str, workers: int, bus: str, why: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The best bus available; an interface that is down is none."""
+
+    class Interface(Channel):
+        def receive(self) -> list[Arrival]:
+            state = PortState(0, ErrorState.DOWN, 0, 0, "Network is down")
+            return [Arrival(0, None, state)] if down and down in self.name else []
+
+        def close(self) -> None:
+            pass
+
+    def open_one(name: BusName) -> Channel:
+        if missing == name.channel:
+            raise CanopenExoError(f"there is no {missing}")
+        return Interface(str(name))
+
+    monkeypatch.setattr("canopen_exo.bus.interfaces.open_channel", open_one)
+    assert best_bus(workers) == (bus, why)
+
+
+@pytest.mark.parametrize("found", ["hub", "vcan"])
+def test_header_says_what_auto_has_chosen_and_the_rig_is_there(
+    found: str, pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And why; the rig itself is not started here."""
+    monkeypatch.setattr("testbench.plugin.hooks.best_bus", lambda workers: (found, "so"))
+    buses = named_buses(found)
+    pytester.makepyfile(f"def test_it(exo):\n    assert exo._setup.buses == {buses!r}\n")
+    result = run(pytester, "--exo-bus=auto")
+    result.assert_outcomes(passed=1)
+    result.stdout.fnmatch_lines([f"exo-hil: bus {found} (auto: so)"])
 
 
 def test_every_test_has_its_own_rig(pytester: pytest.Pytester) -> None:
@@ -471,3 +520,24 @@ def test_fifo_is_asked_for_where_the_command_line_says_so(pytester: pytest.Pytes
     """`--exo-fifo` reaches the processes of the rig; the rig itself is not started here."""
     pytester.makepyfile(f"def test_it(exo):\n    assert exo._setup.fifo is {asked}\n")
     run(pytester, "--exo-bus", "hub", *(["--exo-fifo"] if asked else [])).assert_outcomes(passed=1)
+
+
+def test_control_frames_of_the_command_line_reach_the_rig(pytester: pytest.Pytester) -> None:
+    """`--exo-control-frames`, on every kind of bus; wrong ones fail the test in a line."""
+    pytester.makepyfile("def test_it(exo):\n    assert exo._setup.control_frames == 'drive'\n")
+    run(pytester, "--exo-bus=hub", "--exo-control-frames=drive").assert_outcomes(passed=1)
+    pytester.makepyfile("def test_it(exo):\n    assert exo._injectors._frames.command_id == 0x6C2\n")
+    run(pytester, "--exo-control-frames=drive:0x6C2,0x6C3").assert_outcomes(passed=1)
+    wrong = run(pytester, "--exo-control-frames=middle")
+    wrong.assert_outcomes(errors=1)
+    wrong.stdout.fnmatch_lines(["*allowed is controller or drive*"])
+
+
+def test_a_rig_that_was_late_is_warned_of_though_its_test_has_passed(pytester: pytest.Pytester) -> None:
+    """The limits of the scenario, as a run has them; whoever wants a failure makes an error of the warning."""
+    pytester.makeconftest("from testbench.plugin.lockstep import LockStepExo\nLockStepExo.lateness = 'too late'")
+    pytester.makepyfile("def test_it(exo): pass")
+    result = run_apart(pytester)
+    result.assert_outcomes(passed=1, warnings=1)
+    result.stdout.fnmatch_lines(["*LateRigWarning: too late"])
+    run_apart(pytester, "-W", "error::testbench.plugin.hooks.LateRigWarning").assert_outcomes(passed=1, errors=1)

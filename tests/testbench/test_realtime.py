@@ -8,14 +8,13 @@ from typing import Any
 
 import pytest
 
-from canopen_exo.bus.lateness import Lateness
 from canopen_exo.bus.node import MS, NEVER
 from testbench import realtime_run
 from testbench.cli import INVALID, main
 from testbench.realtime_run import RealTimeRun
 from testbench.scenario import parse_scenario
 from testbench.supervisor import Setup, Supervisor
-from tests.parity.patience import Late, Patience, distributions, is_lateness
+from tests.parity.patience import Late, Patience, is_lateness, why_invalid
 from tests.parity.walks import Bench, attempt_run, in_lock_step
 
 pytestmark = pytest.mark.realtime
@@ -37,9 +36,10 @@ def test_run_realtime_gives_the_document_of_lock_step_and_how_well_it_kept_time(
         code = main(["run", "--realtime", str(file), *shorter])
         output = capsys.readouterr()
         if code == INVALID:
-            reasons = json.loads(output.out)["invalid_reasons"] if output.out else output.err.splitlines()[-1:]
+            found = json.loads(output.out) if output.out else {}
+            reasons = found.get("invalid_reasons") or output.err.splitlines()[-1:]
             assert is_lateness(reasons, HUB.cycle_ns / 1e6), (reasons, output.err)
-            return Late(why_invalid(output.out) or output.err.strip())
+            return Late(why_invalid(found) or output.err.strip())
         assert code == 0, output.err
         return output.out
 
@@ -58,19 +58,6 @@ def test_run_realtime_gives_the_document_of_lock_step_and_how_well_it_kept_time(
         assert timing[name]["latency"]["drive"]["count"] > 1000  # SYNC and six commands a cycle
     files = {path.name for path in (tmp_path / "result").iterdir()}
     assert files >= {"summary.json", "scenario.yaml", "controller.log", "drive.log", "golden.parquet", "joints.png"}
-
-
-def why_invalid(document: str) -> str:
-    """The reasons in a result document, and how late each process served its wake-ups; "" when there is none."""
-    if not document:
-        return ""
-    result = json.loads(document)
-    late = {
-        f"{run}, {name}": Lateness.from_document(one)
-        for run in ("golden", "faulted")
-        for name, one in result["realtime"][run]["lateness"].items()
-    }
-    return f"{', '.join(result['invalid_reasons'])}; {distributions(late)}"
 
 
 @pytest.mark.parametrize("name", ["joints", "gateway"])

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from canopen_exo.bus.node import MS, SECOND
 from fi_gateway.marked_yaml import FileErrors, write
 from fi_gateway.schema import build_injectors
+from testbench.fault_file import load_any
 from testbench.scenario import (
     Expectation,
     Motion,
@@ -412,6 +413,14 @@ def test_limits_of_real_time_are_one_percent_and_20_ms_unless_said() -> None:
     assert (realtime.late_share, realtime.late_worst_ns) == (0.01, 20_000_000)
     realtime = parse_scenario(PLAIN + "realtime: {late_share: 2.5 %, late_worst: 5 ms}\n").realtime
     assert (realtime.late_share, realtime.late_worst_ns) == (0.025, 5_000_000)
+
+
+def test_limits_of_real_time_can_be_set_in_a_file_that_says_nothing_of_them() -> None:
+    """`run --realtime --set realtime.late_share=2%`, and `check` with the same words."""
+    for read in (load_scenario, load_any):
+        found = read(SCENARIOS / "golden.yaml", ["realtime.late_share=2%"])
+        assert isinstance(found, Scenario)
+        assert (found.realtime.late_share, found.realtime.late_worst_ns) == (0.02, 20_000_000)
 
 
 @pytest.mark.parametrize(

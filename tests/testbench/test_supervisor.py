@@ -14,11 +14,14 @@ import subprocess
 import sys
 from pathlib import Path
 
+import can
 import canopen
 import pytest
 
 from canopen_exo.bus.node import SECOND
 from canopen_exo.cia402 import DriveState
+from fi_gateway.bus_control import DEFAULT_COMMAND_ID, DEFAULT_STATUS_ID, Command, Status, read_status
+from fi_gateway.bus_control import DONE as DONE_OVER_BUS
 from testbench import supervisor
 from testbench.child import Process, ProcessError
 from testbench.cli import INVALID, USAGE, main
@@ -60,7 +63,8 @@ def test_rig_told_to_end_leaves_the_drives_disabled(scenario: Scenario, patience
             assert {name: process.code for name, process in rig.processes.items()} == dict.fromkeys(rig.processes, 0)
             states = set(rig.watch.states.values())
             if states != {DriveState.SWITCH_ON_DISABLED} and rig.now() > told_ns + LEAVE_NS:
-                return Late(f"the controller did not get the drives disabled in {LEAVE_NS / 1e9:g} s")
+                words = rig.watch.sync_words()
+                return Late(f"the controller did not get the drives disabled in {LEAVE_NS / 1e9:g} s; {words}")
             return states
 
     assert patience.until_punctual(attempt) == {DriveState.SWITCH_ON_DISABLED}
@@ -136,7 +140,7 @@ def attempt_up(folder: Path, number: signal.Signals) -> int | Late:
         up.stderr.close()
     if code == INVALID:  # drives that missed SYNC for five cycles have stopped by themselves before they were told
         assert gave_up_late("".join(said)), said
-        return Late("".join(said)[-300:])
+        return Late("".join(said)[-600:])
     assert len(children) == 4, said
     assert any(re.match(r"controller bus: hub:127\.0\.0\.1:\d+/controller", line) for line in said)
     where = control.replace(":0", r":[1-9]\d*")  # the port that was free
@@ -151,6 +155,22 @@ def attempt_up(folder: Path, number: signal.Signals) -> int | Late:
 def test_killed_process_is_named_and_the_others_react_and_end(name: str, patience: Patience) -> None:
     """kill -9 of any one process while walking: drives stop by themselves, the others report it; nothing is left."""
     check_killed(HUB, name, patience)
+
+
+@linux
+def test_process_that_hangs_is_killed_and_named_and_the_others_end_in_order(
+    scenario: Scenario, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A stopped process does not hear SIGTERM: it is waited for as long as any other, and no longer."""
+    monkeypatch.setattr(supervisor, "END_NS", 3 * SECOND)
+    told: list[str] = []
+    with nothing_left(Supervisor(Setup(scenario), announce=told.append)) as rig:
+        rig.start(["joints", "gateway"])
+        os.kill(rig.processes["gateway"].pid, signal.SIGSTOP)
+        rig.stop()
+        codes = {name: process.code for name, process in rig.processes.items()}
+    assert told == ["gateway did not end in 3 s and was killed"]
+    assert codes == {"hub": 0, "joints": 0, "gateway": -signal.SIGKILL}
 
 
 # --- not started -----------------------------------------------------------------------------------------------------
@@ -269,6 +289,41 @@ def test_bus_that_is_not_there_is_told_before_anything_starts(scenario: Scenario
         with pytest.raises(BenchError, match="exo-hil hub"):
             rig.start()
         assert rig.processes == {}
+
+
+# --- live control over the bus ---------------------------------------------------------------------------------------
+
+
+def test_gateway_of_a_rig_takes_commands_over_the_bus() -> None:
+    """docs/live_control.md: `--control-frames` of `up` and `run --realtime` reaches the gateway of the rig."""
+    with nothing_left(Supervisor(Setup(HUB.scenario("bias"), control_frames="controller"))) as rig:
+        rig.start(["joints", "gateway"])
+        with can.Bus(rig.buses[0].removeprefix("hub:"), "hub") as tester:
+            command = Command(7, 0, 1).frame(DEFAULT_COMMAND_ID)  # a question
+            tester.send(can.Message(arbitration_id=command.can_id, data=command.data, is_extended_id=False))
+            tester.set_filters([{"can_id": DEFAULT_STATUS_ID, "can_mask": 0x7FF, "extended": False}])
+            answer = tester.recv(LONG_NS / SECOND)
+    assert answer is not None
+    assert read_status(bytes(answer.data)) == Status(DONE_OVER_BUS, 0, 1, 0, "inert")
+
+
+@pytest.mark.parametrize("verb", ["up", "run"])
+def test_command_line_hands_control_frames_to_the_rig(
+    verb: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is given becomes part of the Setup; no rig is started here."""
+    (tmp_path / "rig.yaml").write_text(TEXT)
+    asked: list[Setup] = []
+
+    def refuse(setup: Setup, *given: object) -> int:
+        asked.append(setup)
+        raise BenchError("enough")
+
+    monkeypatch.setattr("testbench.live.run_up", refuse)
+    monkeypatch.setattr("testbench.realtime_run._run_pair", refuse)
+    options = [] if verb == "up" else ["--realtime", "--out", str(tmp_path / "result")]
+    main([verb, str(tmp_path / "rig.yaml"), "--control-frames", "drive:0x6C2,0x6C3", *options])
+    assert [setup.control_frames for setup in asked] == ["drive:0x6C2,0x6C3"]
 
 
 # --- foreign controller ----------------------------------------------------------------------------------------------

@@ -399,6 +399,12 @@ def test_unknown_interface_lists_those_of_python_can() -> None:
         open_python_can("nope", "0", None)
 
 
+def test_interface_that_hears_itself_is_refused() -> None:
+    """A gateway would pass its own frames on for ever; the hub does the same over the same network."""
+    with pytest.raises(CanopenExoError, match=r"hears itself.*use `hub:`"):
+        open_python_can("udp_multicast", "239.74.163.2", None)
+
+
 def test_interface_that_cannot_be_opened_is_one_line() -> None:
     """A serial adapter that is not there, or whose driver is missing."""
     with pytest.raises(CanopenExoError) as failure:

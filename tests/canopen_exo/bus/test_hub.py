@@ -230,6 +230,20 @@ def test_listening_to_other_machines_is_warned_of() -> None:
     assert talk.startswith("hub: warning: 0.0.0.0:")
 
 
+def test_process_whose_talk_nobody_reads_goes_on() -> None:
+    """A client that is refused is told of; when that goes nowhere, the others stay on their bus."""
+    with process("127.0.0.1:0", False, 0) as (running, output):
+        address = output.readline().split()[-1]
+        assert running.stderr is not None
+        running.stderr.close()
+        with Raw(address) as junk, Raw(address).join() as client:
+            junk.link.sendall(b"GET / HTTP/1.0\r\n\r\n")
+            assert junk.refusal()
+            running.terminate()
+            assert client.record() == b""
+        assert running.wait(PATIENCE_S) == 0
+
+
 def test_port_in_use_ends_with_what_to_do(capsys: pytest.CaptureFixture[str]) -> None:
     """Exit code 2 and one line."""
     with contextlib.closing(listen("127.0.0.1", 0)) as taken:

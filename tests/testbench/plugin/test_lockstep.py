@@ -6,6 +6,7 @@ from canopen_exo.bus.trace import trace_hash
 from canopen_exo.cia402 import DriveState
 from canopen_exo.master import MasterState
 from canopen_exo.plan import EMCY, HEARTBEAT, HLC_STATUS, SYNC
+from fi_gateway.bus_control import DEFAULT_COMMAND_ID, DEFAULT_STATUS_ID, Command
 from fi_gateway.errors import FaultError
 from fi_gateway.quantity import QuantityError
 from testbench.cli_rig import DEFAULT_SCENARIO
@@ -43,6 +44,19 @@ GOLDENS = Goldens()  # shared: a golden run costs most of a second
 
 def rig(text: str = DEFAULT_SCENARIO, rate: str = "100 Hz") -> LockStepExo:
     return open_lockstep(parse_scenario(text, "test", [f"rig.rate={rate}"]), GOLDENS, frozenset())
+
+
+# ---- live control over the bus --------------------------------------------------------------------------------------
+
+
+def test_gateway_takes_commands_over_the_bus_where_that_is_asked_for() -> None:
+    """docs/pytest.md: `--exo-control-frames`; a device under test that starts faults by frames does so here as well."""
+    exo = open_lockstep(parse_scenario(FILE, "test"), GOLDENS, frozenset(), "drive")
+    exo.run_until_motion()
+    command = Command(3, 0, 1).frame(DEFAULT_COMMAND_ID)  # trigger
+    exo.send(command.can_id, command.data, bus="drive")
+    exo.expect(DEFAULT_STATUS_ID, within="1 cycle", bus="drive")
+    assert exo.gateway.injection("flip").is_active
 
 
 # ---- time -----------------------------------------------------------------------------------------------------------
@@ -221,6 +235,14 @@ def test_a_sent_frame_passes_the_gateway() -> None:
     seen = exo.expect(0x123, within="1 ms", data=b"\x01\x02", bus="controller")
     assert [row.bus for row in exo.rows if row.frame.can_id == 0x123] == [1, 0]
     assert exo.frames("controller", last=1) == [seen]
+
+
+def test_a_sent_frame_goes_on_the_controller_bus_unless_said() -> None:
+    """docs/pytest.md: as the table of words has it."""
+    exo = rig()
+    exo.send(0x123, b"\x01")
+    exo.expect(0x123, within="1 ms", bus="drive")
+    assert [row.bus for row in exo.rows if row.frame.can_id == 0x123] == [0, 1]
 
 
 # ---- faults ---------------------------------------------------------------------------------------------------------

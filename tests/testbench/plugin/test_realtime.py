@@ -8,8 +8,9 @@ import pytest
 from canopen_exo.bus.channel import Channel
 from canopen_exo.bus.frame import Frame
 from canopen_exo.bus.medium import Transmission
-from canopen_exo.bus.node import MS
+from canopen_exo.bus.node import MS, NEVER
 from canopen_exo.plan import HEARTBEAT, SYNC
+from fi_gateway.control import InjectorRow
 from testbench.cli_rig import DEFAULT_SCENARIO
 from testbench.errors import BenchError
 from testbench.plugin import realtime
@@ -17,6 +18,7 @@ from testbench.plugin.golden import Goldens
 from testbench.plugin.realtime import RealTimeExo
 from testbench.scenario import parse_scenario
 from testbench.supervisor import Supervisor
+from testbench.watch import Watch
 
 CYCLE_NS = 10 * MS
 WANTED = 0x185
@@ -33,6 +35,7 @@ class Rig:
         self.rows: list[Transmission] = []
         self.buses = ("a", "b")
         self.missed = 0
+        self.watch: Watch | None = None
         self.late_ns = 0
         self.lost: list[int] = []
         self.stall_ns = 0
@@ -103,6 +106,33 @@ def exo(rig: Rig) -> RealTimeExo:
     exo._rig = cast(Supervisor, rig)
     exo._rows = rig.rows
     return exo
+
+
+@pytest.mark.parametrize(
+    ("late", "off_ms", "words"),
+    [(0, 0.0, ""), (1, 20.0, ""), (2, 0.0, "2 of 100 cycles late"), (0, 20.1, "SYNC off by at most 20.1 ms")],
+)
+def test_rig_is_late_beyond_what_its_scenario_allows(
+    rig: Rig, exo: RealTimeExo, late: int, off_ms: float, words: str
+) -> None:
+    """docs/pytest.md: the limits of `realtime:`, by default 1 % of the cycles and 20 ms."""
+    watch = rig.watch = Watch(exo.plan)
+    watch.cycles, watch.late = 100, late
+    watch.offsets.add(round(off_ms * MS))
+    assert bool(exo.lateness) == bool(words)
+    assert words in exo.lateness
+
+
+@pytest.mark.parametrize(("off_ms", "is_late"), [(20.0, False), (20.1, True)])
+def test_cycles_that_a_fault_may_have_made_late_are_not_judged(
+    rig: Rig, exo: RealTimeExo, off_ms: float, is_late: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A test that keeps SYNC from the drives is not told that its rig was late; SYNC itself is judged all the same."""
+    monkeypatch.setattr(exo._injectors, "listing", lambda: [InjectorRow("drop", "spent", NEVER, 1, 1, 1)])
+    watch = rig.watch = Watch(exo.plan)
+    watch.cycles, watch.late = 100, 50
+    watch.offsets.add(round(off_ms * MS))
+    assert bool(exo.lateness) == is_late
 
 
 def test_frames_from_before_the_call_are_not_the_expected_one(rig: Rig, exo: RealTimeExo) -> None:

@@ -9,7 +9,9 @@ from typing import Final
 
 import pytest
 
+from testbench.plugin.hooks import best_bus
 from tests.parity.patience import Late, Patience, told_late
+from tests.vcan import uml
 
 HIL: Final = """
 from canopen_exo.cia402 import DriveState
@@ -58,3 +60,10 @@ def test_a_users_test_runs_on_vcan(tmp_path: Path, patience: Patience) -> None:
         return Late("; ".join(late))
 
     patience.until_punctual(attempt)
+
+
+def test_auto_is_vcan_while_both_interfaces_are_up() -> None:
+    """docs/pytest.md: the best bus that is there; one that is down carries nothing."""
+    assert best_bus(1) == ("vcan", "vcan0 and vcan1 can be opened")
+    uml.set_link("vcan1", up=False)
+    assert best_bus(1) == ("hub", "bus socketcan:vcan1: interface down")

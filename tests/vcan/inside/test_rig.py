@@ -6,6 +6,7 @@ import signal
 from collections import Counter
 from importlib.resources import as_file, files
 from pathlib import Path
+from typing import Any
 
 import can
 import canopen
@@ -15,7 +16,7 @@ from canopen_exo import plan as ids
 from canopen_exo.cia402 import DriveState
 from testbench.cli import FAIL, INVALID, PASS
 from testbench.supervisor import Supervisor
-from tests.parity.patience import Late, Patience, gave_up_late, is_lateness
+from tests.parity.patience import Late, Patience, gave_up_late, is_lateness, why_invalid
 from tests.parity.rigs import check_killed, heard
 from tests.vcan.inside.peers import wait_until
 from tests.vcan.inside.programs import VCAN, Program, our_processes
@@ -42,13 +43,14 @@ def test_run_realtime_on_vcan_with_a_fault_gives_verdict_and_result_folder(
             program.close()
         if code != INVALID:
             return program
+        found: dict[str, Any] = {}
         if (out / "summary.json").exists():
-            reasons = json.loads((out / "summary.json").read_text())["invalid_reasons"]
-        else:  # drives that missed SYNC for five cycles have stopped by themselves
-            reasons = program.printed.strip().splitlines()[-1:]
+            found = json.loads((out / "summary.json").read_text())
+        # else drives that missed SYNC for five cycles have stopped by themselves
+        reasons = found.get("invalid_reasons") or program.printed.strip().splitlines()[-1:]
         is_late = is_lateness(reasons, VCAN.cycle_ns / 1e6) or "not ready after " in program.printed
         assert is_late, (reasons, program.printed)
-        return Late(", ".join(reasons))
+        return Late(why_invalid(found) or ", ".join(reasons))
 
     program = patience.until_punctual(attempt)
     assert program.code == FAIL, program.printed
@@ -79,7 +81,7 @@ def test_rig_on_vcan_ends_in_order_with_ctrl_c(tmp_path: Path, patience: Patienc
         assert not control.exists()
         if code == INVALID:  # drives that missed SYNC for five cycles have stopped by themselves
             assert gave_up_late(rig.printed), rig.printed
-            return Late(rig.printed.strip().splitlines()[-1])
+            return Late("; ".join(rig.printed.strip().splitlines()[-3:]))
         assert (len(running), is_there) == (4, True), rig.printed
         return rig
 
