@@ -17,6 +17,18 @@ _FEW: Final = 12
 """Fewer delays than these are counted one by one."""
 
 
+def _lower(index: int) -> int:
+    """The smallest value of a bin: 0..15 have one each; from there eight to the octave."""
+    if index < 16:
+        return index
+    octave = (index >> 3) - 1
+    return (index - (octave << 3)) << octave
+
+
+_EDGES: Final = [_lower(index) for index in range(1, _BINS)]
+"""`bisect_right` finds the bin of a value in them: the first of what is negative, the last of what is too large."""
+
+
 class LatenessDocument(TypedDict):
     """As in JSON. bins: pairs of lower edge [ns] and count, the empty ones left out; percentiles in ns."""
 
@@ -43,11 +55,7 @@ class Lateness:
         self.count += 1
         if delay_ns > self.worst_ns:
             self.worst_ns = delay_ns
-        if 15 < delay_ns <= _TOP_NS:  # as `_bin`: this runs for every frame of a gateway
-            octave = delay_ns.bit_length() - 4
-            self._bins[(octave << 3) + (delay_ns >> octave)] += 1
-        else:
-            self._bins[_bin(delay_ns)] += 1
+        self._bins[bisect_right(_EDGES, delay_ns)] += 1
 
     def add_since(self, times: list[int], now: int) -> None:
         """Count the delays of these times, in ascending order, until `now`."""
@@ -58,10 +66,10 @@ class Lateness:
         if left < _FEW:
             bins = self._bins
             for time_ns in times:
-                bins[_bin(now - time_ns)] += 1
+                bins[bisect_right(_EDGES, now - time_ns)] += 1
             return
         while left:  # bin by bin, from the shortest
-            index = _bin(now - times[left - 1])
+            index = bisect_right(_EDGES, now - times[left - 1])
             first = bisect_right(times, now - _lower(index + 1), 0, left)
             self._bins[index] += left - first
             left = first
@@ -113,7 +121,7 @@ class Lateness:
             for lower, number in document["bins"]:
                 if not (type(lower) is int and type(number) is int and 0 <= lower <= _TOP_NS and number >= 0):
                     raise ValueError(f"bin {[lower, number]}")
-                lateness._bins[_bin(lower)] += number
+                lateness._bins[bisect_right(_EDGES, lower)] += number
                 lateness.count += number
             lateness.worst_ns = int(document["worst_ns"])
             if lateness.count != document["count"]:
@@ -123,21 +131,3 @@ class Lateness:
                 f"lateness: no distribution: {error}; allowed is what Lateness.document() wrote"
             ) from error
         return lateness
-
-
-def _bin(value: int) -> int:
-    """0..15 have a bin each; from there eight bins to the octave; what is negative counts as 0."""
-    if value < 16:
-        return value if value > 0 else 0
-    if value > _TOP_NS:
-        value = _TOP_NS
-    octave = value.bit_length() - 4
-    return (octave << 3) + (value >> octave)
-
-
-def _lower(index: int) -> int:
-    """The smallest value of a bin."""
-    if index < 16:
-        return index
-    octave = (index >> 3) - 1
-    return (index - (octave << 3)) << octave

@@ -107,10 +107,9 @@ class ShortCut:
         stops: list[tuple[int, int, int]] = []  # stamp, place and number of those that do not only pass
         for place, _, channel in self._ways:
             if at[place] < ends[place]:
-                table, ids, stamps = filters[place], channel.ids, channel.stamps
-                for number in range(at[place], ends[place]):
-                    if table[ids[number]] != PASS_ON:
-                        stops.append((stamps[number], place, number))
+                for number, action in enumerate(map(filters[place].__getitem__, channel.ids)):
+                    if action != PASS_ON and number >= at[place]:
+                        stops.append((channel.stamps[number], place, number))
         if ends[0] and ends[1]:
             stops.sort()
         for stamp, place, number in stops:

@@ -132,7 +132,7 @@ def test_controller_that_keeps_the_order_sends_what_came_first() -> None:
     assert [frame.can_id for _, _, frame in carried(medium)] == [0x200, 0x300, 0x100, 0x380, 0x400]
 
 
-@given(st.lists(st.tuples(st.integers(0, 2), st.integers(0, 0x7FF)), max_size=40))
+@given(st.lists(st.tuples(st.integers(0, 2), st.integers(0, 0x7FF)), max_size=40, unique_by=lambda one: one[1]))
 def test_queues_that_keep_the_order_pass_as_a_merge_of_them(queued: list[tuple[int, int]]) -> None:
     """At each idle bus the lowest of what the controllers offer wins; ports 0 and 1 offer their oldest frame."""
     medium = bus(3)
