@@ -3,6 +3,7 @@
 A reader that is gone (Ctrl-C goes to a whole pipeline and ends its `tee`), a full disk, a terminal that was closed.
 """
 
+import contextlib
 import errno
 import os
 import sys
@@ -28,6 +29,9 @@ def put(stream: TextIO | None, text: str) -> OSError | None:
 
 def show(text: str) -> None:
     """The result, to stdout. A reader that has left (`| head`) is not worth a word, anything else is."""
+    if sys.stdout is not None:
+        with contextlib.suppress(OSError, ValueError):  # a result is worth waiting for a reader that is slow
+            os.set_blocking(sys.stdout.fileno(), True)
     error = put(sys.stdout, text)
     if error is not None and not isinstance(error, BrokenPipeError):
         tell(f"stdout: {error.strerror or error}; the result could not be printed there")

@@ -181,8 +181,8 @@ class Injector:
 
     @property
     def adds(self) -> bool:
-        """Whether it sends frames of its own, or under another COB-ID: see Fault."""
-        return self._fault.adds
+        """Whether it sends frames of its own, or under another COB-ID (see Fault), reports included."""
+        return self._fault.adds or len(self.reports) > 0
 
     def takes(self, cob_id: int) -> bool:
         """Whether frames with that COB-ID are its target, or fire it."""

@@ -226,7 +226,7 @@ def _overflow_lines(document: Summary) -> list[str]:
 def _hollow_lines(document: Summary) -> list[str]:
     """Why a pass says nothing of faults, unless an `expect:` line has decided on that, and which line would fail it."""
     counts, injectors = document["counts"], document["injectors"]
-    if not injectors or counts["manifested"] or document["verdict"] != "pass":
+    if not injectors or counts["manifested"] or document["verdict"] != "pass" or not document["valid"]:
         return []
     quantity = "manifested" if counts["activated"] else "injections"
     if any(entry["text"].split()[0] == quantity for entry in document["expectations"]):

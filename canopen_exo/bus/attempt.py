@@ -55,14 +55,15 @@ def put_back(waiting: list[tuple[Frame, Port]], frame: Frame, port: Port) -> Non
 
 
 def controllers_of(
-    offers: list[tuple[Frame, Port]], unsettled: list[Controller], ports: list[Port]
+    offers: list[tuple[Frame, Port]], unsettled: list[Controller], ports: list[Port], late: int = 0
 ) -> list[Controller]:
     """Who takes part: senders of the offers, last one first, then receivers; ports: of the medium, by number.
 
     unsettled: those that have not come to rest after an earlier error; they go on from where they were.
+    late: mask of ports that do not take part yet.
     """
     controllers: list[Controller] = []
-    known = 0
+    known = late
     sending = 0
     for _, port in offers:
         sending |= 1 << port.number

@@ -108,14 +108,14 @@ class Wire(Wiring):
         disruptions: list[Disruption] = []
         if self.disturbances:
             disruptions = self._ask(now, now + (bits + MARGIN) * bit_ns, frame, port.number)
-        if disruptions or self._unsettled or self._is_contested(frame, port):
+        if disruptions or self._unsettled or self._is_contested(now, frame, port):
             self._attempt(now, self._offers(now), disruptions)
             return
         medium.waiting.pop(at)
         medium.on_wire = first
         medium.end = now + bits * bit_ns
         self._is_held = False
-        medium.is_watched = self._is_charged or not self._is_calm
+        medium.is_watched = self._is_charged or not self._is_calm or medium.has_order
         self._started_ns = now
 
     def _ask(self, now: int, until: int, frame: Frame | None, sender: int) -> list[Disruption]:
@@ -129,10 +129,10 @@ class Wire(Wiring):
                 self._suspects.append((disturbance, min([one.first for one in found])))
         return disruptions
 
-    def _is_contested(self, frame: Frame, port: Port) -> bool:
+    def _is_contested(self, now: int, frame: Frame, port: Port) -> bool:
         """Nobody is there to acknowledge, or another port begins with the same arbitration bits."""
         medium = self.medium
-        if len(medium.ports) - self._states.absent < 2:
+        if len(medium.ports) - self._states.absent - self._late(now).bit_count() < 2:
             return True
         waiting = medium.waiting
         if len(waiting) == 1 or (self._is_calm and waiting[1][0].arbitration != frame.arbitration):
@@ -144,6 +144,13 @@ class Wire(Wiring):
                 medium.collisions += 1
                 return True
         return False
+
+    def _late(self, now: int) -> int:
+        """Mask of the ports that take no part in a frame that begins at `now`: they have just been plugged in."""
+        if not self._joined_ns:
+            return 0
+        self._joined_ns = {number: at for number, at in self._joined_ns.items() if at > now}
+        return sum([1 << number for number in self._joined_ns])
 
     def _offers(self, now: int) -> list[tuple[Frame, Port]]:
         """What each controller that may send now would send, in order of arbitration."""
@@ -186,7 +193,7 @@ class Wire(Wiring):
     def _attempt(self, now: int, offers: list[tuple[Frame, Port]], disruptions: list[Disruption]) -> None:
         medium = self.medium
         self.attempts += 1
-        self._initial = controllers_of(offers, self._unsettled, medium.ports)
+        self._initial = controllers_of(offers, self._unsettled, medium.ports, self._late(now))
         self._sent = offers[0][0] if offers else None
         self._started_ns = now
         self._done = 0
@@ -396,6 +403,7 @@ class Wire(Wiring):
     def disconnect(self, now: int, port: Port) -> None:
         """Its node is unplugged: what waits is lost, and nobody acknowledges there any more."""
         self._states.unplug(port)
+        self._joined_ns.pop(port.number, None)
         self._is_calm = False
         self._plan_wake(now + 1)
 

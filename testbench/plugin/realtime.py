@@ -28,7 +28,7 @@ from testbench.plugin.golden import Goldens
 from testbench.plugin.injection import NOT_RUN, GatewayControl, Part
 from testbench.process import open_bus
 from testbench.record import Truth
-from testbench.scenario import Scenario
+from testbench.scenario import Scenario, refuse_queues
 from testbench.supervisor import Setup, Supervisor
 
 _WHAT: Final = "a rig of processes"
@@ -47,6 +47,7 @@ class RealTimeGateway(GatewayControl):
 
     def __init__(self, scenario: Scenario) -> None:
         refuse_wire_faults(scenario.injectors, _WHAT)
+        refuse_queues(scenario, _WHAT)
         super().__init__(scenario)
         self.acted_ns: int = 0
         self._address: str = ""

@@ -268,6 +268,15 @@ def test_a_pass_in_which_no_fault_acted_is_headed_so(
     assert max(len(line) for line in lines) <= 100
 
 
+def test_an_invalid_run_is_headed_invalid_alone(run_maker: RunMaker) -> None:
+    """Whether a fault acted does not matter then, and an expectation would change nothing."""
+    found = document(run_maker(), run_maker(), [], 2)
+    found["valid"] = False
+    text = summary_text(found)
+    assert text.startswith("INVALID  ")
+    assert "injections >= 1" not in text
+
+
 @pytest.mark.parametrize("line", ["injections >= 1", "manifested >= 1"])
 def test_an_expectation_that_a_fault_acts_fails_a_run_in_which_none_did(run_maker: RunMaker, line: str) -> None:
     """What CI reads is the exit code."""

@@ -286,6 +286,16 @@ def test_transmit_queues_that_keep_the_order_are_chosen_in_the_scenario() -> Non
     assert results[0].document["trace_hash"]["faulted"] != results[1].document["trace_hash"]["faulted"]
 
 
+def test_transmit_queues_that_keep_the_order_work_where_errors_are_possible() -> None:
+    """A fault that could collide, and acts late: until then the run is the golden one, and frames go on passing."""
+    late = injector("again", "{pdo: TPDO1, node: left_hip, bus: to_controller}", "{type: duplicate}",
+                    "{type: at, time: 0.9 s}")  # fmt: skip
+    result = run_scenario(parse_scenario(HEAD + f"  {late}\n", overrides=["rig.queues=fifo"]))
+    assert result.document["valid"], result.document["invalid_reasons"]
+    assert result.document["completed"]
+    assert len(result.faulted.rows) == len(result.golden.rows) + 1
+
+
 @pytest.mark.parametrize("line", [["up"], ["run", "--realtime"]])
 def test_buses_whose_queues_cannot_be_chosen_refuse_the_scenario(
     line: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -28,7 +28,7 @@ from testbench.realtime_run import RealTimeRun, check_without, limits_in, pair_r
 from testbench.record import RunRecord
 from testbench.rig import RigParams
 from testbench.run import judge_pair, rig_params
-from testbench.scenario import Scenario, parse_scenario
+from testbench.scenario import Scenario, parse_scenario, refuse_queues
 from testbench.summary import versions
 from testbench.supervisor import Setup
 from testbench.timing import TimingLimits
@@ -58,6 +58,7 @@ def check_scenario(scenario: Scenario, rigging: Rigging) -> None:
         raise BenchError(f"{what}: --without gateway leaves nothing to inject with; take it away")
     check_without(scenario, rigging.without)
     refuse_wire_faults(scenario.injectors, what)
+    refuse_queues(scenario, what)
     for name, spec in scenario.injectors.items():
         if spec.enabled and spec.start == "power_up":
             raise BenchError(

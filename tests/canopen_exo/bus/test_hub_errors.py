@@ -227,6 +227,19 @@ def test_client_that_joins_an_idle_bus_waits_for_11_bits() -> None:
     assert [one[1] for one in told(sender)] == [0x181]
 
 
+def test_client_that_has_just_joined_acknowledges_no_frame_that_it_does_not_hear() -> None:
+    """The sender was alone until then: the frame is repeated until the other one takes part."""
+    hub = hub_with()
+    sender = join(hub)
+    run(hub, MS)
+    late = join(hub, now=MS)
+    send(hub, sender, 1, MS + 5 * BIT)
+    run(hub, 5 * MS)
+    assert [one[1] for one in told(late) if not one[2]] == [0x181]
+    assert [one[1] for one in told(sender)] == [0x2A0]  # one error frame: no acknowledgement
+    assert bus_of(hub).medium.ports[0].tec == 8 - 1
+
+
 def test_python_can_shows_error_frames(start_hub: StartHub) -> None:
     """`is_error_frame`, with the classes of linux/can/error.h."""
 

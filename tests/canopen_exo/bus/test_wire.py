@@ -253,6 +253,16 @@ def test_frame_that_is_repeated_keeps_its_place_in_a_queue_that_keeps_the_order(
     assert [row.frame for row in again.loop.trace if not row.frame.flags] == [FRAME, urgent]
 
 
+def test_queue_that_keeps_the_order_empties_where_errors_are_possible_and_none_happens() -> None:
+    """All frames of a controller go, one after the other."""
+    frames = [Frame(can_id, b"") for can_id in (5, 3, 4, 9)]
+    bus = Bus([Talker(*[(0, frame) for frame in frames]), Talker()])
+    bus.medium.ports[0].keep_order()
+    bus.loop.run_until(MS)
+    assert [row.frame for row in bus.loop.trace] == frames
+    assert bus.medium.ports[0].queued == 0
+
+
 def test_port_without_restart_stays_off() -> None:
     """restart-ms 0 of Linux: somebody must do it."""
     node = Talker()

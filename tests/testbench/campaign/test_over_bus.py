@@ -60,6 +60,11 @@ def test_wire_faults_are_refused_with_what_they_need() -> None:
         check_scenario(parse_scenario(scenario_with(WIRE)), Rigging())
 
 
+def test_transmit_queues_cannot_be_chosen_on_a_bus() -> None:
+    with pytest.raises(BenchError, match=r"rig\.queues: fifo given, exo-hil campaign run --realtime cannot choose"):
+        check_scenario(parse_scenario(HUB.text(), overrides=["rig.queues=fifo"]), Rigging())
+
+
 @pytest.mark.run
 @pytest.mark.parametrize("grace_s", [0.0, 0.2])
 def test_run_that_walks_on_is_judged_as_if_it_had_ended_at_its_failure(grace_s: float) -> None:
