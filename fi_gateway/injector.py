@@ -1,7 +1,7 @@
 """Injectors: target + fault + event + effect (+ trigger), each with its windows over time.
 
 The gateway tells an injector the time and shows it the frames; `windows` opens and closes it, `passage` carries out
-what its fault asks for.
+what its fault asks for. A few lines beyond the usual length: all that an injector is made of and copied with is here.
 """
 
 import zlib

@@ -12,17 +12,22 @@ from canopen_exo.bus.error_frame import write_error_frame
 from canopen_exo.bus.frame import FLAG_ERROR, Frame
 from canopen_exo.bus.medium import CLOSED, Medium, Port, WireEvent
 from canopen_exo.bus.node import NEVER, ErrorState, PortState
-from canopen_exo.bus.recovery import Recovery, is_present
+from canopen_exo.bus.recovery import RECESSIVE_BITS, Recovery, is_present
 
 
 @final
 class ErrorStates:
-    """Of the ports of one medium. absent: ports that are bus-off or unplugged; recoveries: on their way back."""
+    """Of the ports of one medium. absent: ports that are bus-off or unplugged; recoveries: on their way back.
+
+    By port number - holds: how often it is held off; joined_ns: when one that has been plugged in takes part.
+    """
 
     def __init__(self, medium: Medium) -> None:
         self.medium: Final[Medium] = medium
         self.absent: int = 0
         self.recoveries: list[Recovery] = []
+        self.holds: dict[int, int] = {}
+        self.joined_ns: dict[int, int] = {}
 
     def count(self, now: int, port: Port, tec: int, rec: int, events: list[WireEvent]) -> None:
         """New counters of a port, and what follows from them."""
@@ -53,12 +58,39 @@ class ErrorStates:
         if is_present(port):
             self._close(port)
         self.forbid(port)
+        self.joined_ns.pop(port.number, None)
         port.state = ErrorState.DOWN
 
     def plug(self, now: int, port: Port) -> None:
-        """A node is there where one was unplugged."""
-        self._open(now, port)
-        port.state = ErrorState.ERROR_ACTIVE
+        """A node is there. It takes part once it has seen 11 recessive bits: the end of a frame has them."""
+        if port.state is ErrorState.DOWN:
+            self._open(now, port)
+            port.state = ErrorState.ERROR_ACTIVE
+        end = self.medium.end
+        port.ready_ns = now + RECESSIVE_BITS * self.medium.bit_ns if end == NEVER else end
+        self.joined_ns[port.number] = port.ready_ns
+
+    def late(self, now: int) -> int:
+        """Mask of the ports that take no part in a frame that begins at `now`: they have just been plugged in."""
+        if not self.joined_ns:
+            return 0
+        self.joined_ns = {number: at for number, at in self.joined_ns.items() if at > now}
+        return sum([1 << number for number in self.joined_ns])
+
+    def takes_part(self, port: Port, began: int) -> bool:
+        """Whether it hears the frame that began then."""
+        return is_present(port) and self.joined_ns.get(port.number, 0) <= began
+
+    def hold(self, port: Port) -> None:
+        """It is not to restart until `let_go` was called as often as this."""
+        self.holds[port.number] = self.holds.get(port.number, 0) + 1
+        self.forbid(port)
+
+    def let_go(self, port: Port, restart_at: int) -> None:
+        """Ask a port that nobody holds off any more to restart then."""
+        self.holds[port.number] -= 1
+        if self.holds[port.number] == 0 and port.state is ErrorState.BUS_OFF:
+            self.request(port, restart_at)
 
     def hear(self, free_ns: int, now: int) -> None:
         """The bus was recessive from `free_ns` to `now`, when a frame begins."""
@@ -112,4 +144,5 @@ class ErrorStates:
         self.absent -= 1
 
     def __reduce__(self) -> tuple[type["ErrorStates"], tuple[Medium], dict[str, object]]:
-        return ErrorStates, (self.medium,), {"absent": self.absent, "recoveries": self.recoveries}
+        names = ("absent", "recoveries", "holds", "joined_ns")
+        return ErrorStates, (self.medium,), {name: getattr(self, name) for name in names}

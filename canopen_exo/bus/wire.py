@@ -26,7 +26,7 @@ from canopen_exo.bus.error_frame import write_bus_error
 from canopen_exo.bus.error_states import ErrorStates
 from canopen_exo.bus.frame import FLAG_ERROR, Frame
 from canopen_exo.bus.medium import Medium, Port, WireEvent, Wiring
-from canopen_exo.bus.node import NEVER, ErrorState, Out
+from canopen_exo.bus.node import NEVER, Out
 from canopen_exo.bus.recovery import RECESSIVE_BITS, is_present
 
 MARGIN: Final = 64
@@ -39,10 +39,9 @@ _LONGEST_REST: Final = 32
 """Recessive bits after which every controller that sends nothing is at rest."""
 
 _STATE: Final = (
-    "disturbances", "sink", "wake_at", "attempts", "spans",
-    "_started_ns", "_disruptions", "_initial", "_engaged", "_steps", "_done", "_unsettled", "_free_ns",
-    "_states", "_suspects", "_sent", "_is_noticed", "_is_charged", "_is_calm", "_is_stale", "_is_held",
-    "_holds", "_joined_ns",
+    "disturbances", "sink", "wake_at", "attempts", "spans", "_started_ns", "_disruptions", "_initial", "_engaged",
+    "_steps", "_done", "_unsettled", "_free_ns", "_states", "_suspects", "_sent", "_is_noticed", "_is_charged",
+    "_is_calm", "_is_stale", "_is_held",
 )  # fmt: skip
 """What `__reduce__` copies besides the medium, which need not be whole yet."""
 
@@ -77,8 +76,6 @@ class Wire(Wiring):
         self._is_calm: bool = True
         self._is_stale: bool = False
         self._is_held: bool = False
-        self._holds: dict[int, int] = {}
-        self._joined_ns: dict[int, int] = {}
         for disturbance in disturbances:
             self.wake_at = min(self.wake_at, disturbance.next_ns(1))
 
@@ -132,7 +129,7 @@ class Wire(Wiring):
     def _is_contested(self, now: int, frame: Frame, port: Port) -> bool:
         """Nobody is there to acknowledge, or another port begins with the same arbitration bits."""
         medium = self.medium
-        if len(medium.ports) - self._states.absent - self._late(now).bit_count() < 2:
+        if len(medium.ports) - self._states.absent - self._states.late(now).bit_count() < 2:
             return True
         waiting = medium.waiting
         if len(waiting) == 1 or (self._is_calm and waiting[1][0].arbitration != frame.arbitration):
@@ -144,13 +141,6 @@ class Wire(Wiring):
                 medium.collisions += 1
                 return True
         return False
-
-    def _late(self, now: int) -> int:
-        """Mask of the ports that take no part in a frame that begins at `now`: they have just been plugged in."""
-        if not self._joined_ns:
-            return 0
-        self._joined_ns = {number: at for number, at in self._joined_ns.items() if at > now}
-        return sum([1 << number for number in self._joined_ns])
 
     def _offers(self, now: int) -> list[tuple[Frame, Port]]:
         """What each controller that may send now would send, in order of arbitration."""
@@ -193,7 +183,7 @@ class Wire(Wiring):
     def _attempt(self, now: int, offers: list[tuple[Frame, Port]], disruptions: list[Disruption]) -> None:
         medium = self.medium
         self.attempts += 1
-        self._initial = controllers_of(offers, self._unsettled, medium.ports, self._late(now))
+        self._initial = controllers_of(offers, self._unsettled, medium.ports, self._states.late(now))
         self._sent = offers[0][0] if offers else None
         self._started_ns = now
         self._done = 0
@@ -221,10 +211,8 @@ class Wire(Wiring):
             return
         known = self._suspects
         until = max(self._started_ns + frame.bits * medium.bit_ns, now) + MARGIN * medium.bit_ns
-        if is_plain or self._sent is not None:
-            found = self._ask(self._started_ns, until, frame, port.number)
-        else:
-            found = self._ask(self._started_ns, until, None, -1)
+        sends = is_plain or self._sent is not None
+        found = self._ask(self._started_ns, until, frame if sends else None, port.number if sends else -1)
         self._suspects = known + [one for one in self._suspects if one not in known]
         before = [] if is_plain else self._disruptions
         found = joined(before, found, (now - self._started_ns) // medium.bit_ns)
@@ -347,9 +335,7 @@ class Wire(Wiring):
         """Whether any counter is above 0."""
         self._is_charged = False
         for port in self.medium.ports:
-            if port.tec or port.rec:
-                self._is_charged = True
-                return
+            self._is_charged = self._is_charged or port.tec + port.rec > 0
 
     # --- error states and disturbances, from outside ----------------------------------------------------------------
 
@@ -360,7 +346,7 @@ class Wire(Wiring):
 
     def hears(self, port: Port) -> bool:
         """It took part in the bus from the beginning of what is, or was last, on the wire."""
-        return is_present(port) and self._joined_ns.get(port.number, 0) <= self._started_ns
+        return self._states.takes_part(port, self._started_ns)
 
     def reconsider(self) -> None:
         """Counters or states of ports were set from outside."""
@@ -379,18 +365,15 @@ class Wire(Wiring):
 
     def hold_off(self, now: int, port: Port) -> None:
         """Make a port bus-off and keep it so, whatever its counters, until `let_go` was called as often as this."""
-        self._holds[port.number] = self._holds.get(port.number, 0) + 1
         self.switch_off(now, port)
-        self._states.forbid(port)
+        self._states.hold(port)
         self._plan_wake(now + 1)
 
     def let_go(self, now: int, port: Port, delay_ns: int = 0) -> None:
         """Ask a port that nobody holds off any more to restart in `delay_ns`, whatever its `restart_ns`."""
-        self._holds[port.number] -= 1
-        if self._holds[port.number] == 0 and port.state is ErrorState.BUS_OFF:
-            self._states.request(port, now + delay_ns)
-            self._is_calm = False
-            self._plan_wake(now + 1)
+        self._states.let_go(port, now + delay_ns)
+        self._is_calm = False
+        self._plan_wake(now + 1)
 
     def replan(self, now: int) -> None:
         """A disturbance has begun or ended: look at it as soon as the nodes are woken at `now`.
@@ -403,17 +386,12 @@ class Wire(Wiring):
     def disconnect(self, now: int, port: Port) -> None:
         """Its node is unplugged: what waits is lost, and nobody acknowledges there any more."""
         self._states.unplug(port)
-        self._joined_ns.pop(port.number, None)
         self._is_calm = False
         self._plan_wake(now + 1)
 
     def connect(self, now: int, port: Port) -> None:
-        """A node is plugged in. It takes part once it has seen 11 recessive bits: the end of a frame has them."""
-        if port.state is ErrorState.DOWN:
-            self._states.plug(now, port)
-        medium = self.medium
-        is_idle = medium.end == NEVER
-        port.ready_ns = self._joined_ns[port.number] = now + RECESSIVE_BITS * medium.bit_ns if is_idle else medium.end
+        """A node is plugged in."""
+        self._states.plug(now, port)
         self._is_calm = False
         self._plan_wake(now + 1)
 

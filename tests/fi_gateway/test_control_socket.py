@@ -1,4 +1,7 @@
-"""Live control over a local socket: a server that is driven by hand, real sockets, no sleeping."""
+"""Live control over a local socket: a server that is driven by hand, real sockets, no sleeping.
+
+All tests share that server and its clients, so they stand in one module.
+"""
 
 import itertools
 import json

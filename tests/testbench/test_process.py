@@ -1,6 +1,7 @@
 """Processes of a rig: their command line, what they say when they cannot run, how they take signals.
 
-Real processes against the clock are in test_supervisor.py and test_realtime.py.
+Real processes against the clock are in test_supervisor.py and test_realtime.py. One module, although long: each
+verb is held to the same rules.
 """
 
 import argparse

@@ -1,4 +1,7 @@
-"""The pytest plug-in as its users meet it: pytest runs inside the test, with the plug-in loaded by name."""
+"""The pytest plug-in as its users meet it: pytest runs inside the test, with the plug-in loaded by name.
+
+One module, although long: all tests share that way of running pytest.
+"""
 
 import subprocess
 import sys

@@ -111,8 +111,8 @@ def test_nothing_waits_for_an_interface_that_is_off(state: ErrorState, sign: Fra
     loop = world.loop(node, [0])
     loop.run(until(world, 2 * MS))
     assert (loop.losses_by_channel(), channel.sent) == ([Losses(discarded=2)], [])
-    is_frame = isinstance(sign, Frame)
-    channel.inbox.append(Arrival(3 * MS, sign if is_frame else None, None if is_frame else sign))  # type: ignore[arg-type]
+    arrival = Arrival(3 * MS, sign, None) if isinstance(sign, Frame) else Arrival(3 * MS, None, sign)
+    channel.inbox.append(arrival)
     node.wake_at = 4 * MS
     loop.run(until(world, 5 * MS))
     channel.takes = 9
