@@ -29,7 +29,7 @@ from mypy_extensions import mypyc_attr
 
 from canopen_exo.bus.frame import Frame
 from canopen_exo.bus.medium import Medium
-from canopen_exo.bus.node import MS, NEVER, PASS_ON, TAKE, ErrorState, Out, PortState, Relay
+from canopen_exo.bus.node import LOOK, MS, NEVER, PASS_ON, TAKE, ErrorState, Out, PortState, Relay
 from canopen_exo.bus.wire import Wire
 from canopen_exo.plan import STATUS_MOTION, STATUS_STOPPED
 from canopen_exo.sync import SyncCadence
@@ -129,7 +129,7 @@ class Gateway(Relay):
     those that changed a port's state; malformed: status frames too short to read. time_zero: ns, NEVER until known;
     cadence: of SYNC from the controller.
 
-    Eleven public methods: four are a Node's life and its end, five are live control's, two are for wire faults.
+    Twelve public methods: five are a Node's life and its end, five are live control's, two are for wire faults.
     """
 
     def __init__(self, injectors: list[Injector], cycle_ns: int, passage: Passage | None = None) -> None:
@@ -201,6 +201,10 @@ class Gateway(Relay):
                 self.undelivered[port] += 1
                 return
         out.send(1 - port, frame)
+
+    def look(self, now: int, port: int, can_id: int) -> None:
+        """A SYNC from the controller has passed: time 0 is told from it."""
+        self.cadence.received(now)
 
     def wake(self, now: int, out: Out) -> None:
         """Open and close the windows that are due, and send what faults have put off until now."""
@@ -302,7 +306,16 @@ class Gateway(Relay):
         for port, table in ((CONTROLLER_PORT, self._from_controller), (DRIVE_PORT, self._from_drives)):
             filters = self.filters[port]
             for cob_id, route in enumerate(table):
-                filters[cob_id] = PASS_ON if route is None and not self._is_disturbed else TAKE
+                if self._is_disturbed:
+                    filters[cob_id] = TAKE
+                elif route is None:
+                    filters[cob_id] = PASS_ON
+                else:
+                    filters[cob_id] = LOOK if route.kind == SYNC_READ and self._only_looks_at(route) else TAKE
+
+    def _only_looks_at(self, route: Route) -> bool:
+        """Whether frames on this route go to no injector, no trigger, and to no wire fault that is to be woken."""
+        return not (route.injectors or route.watchers or self._has_wire or self._power_up == NEVER)
 
     def _power_on(self, now: int) -> None:
         """The first frame: start the injectors that count from here."""

@@ -61,6 +61,7 @@ class Out:
 IGNORE: Final = 0
 TAKE: Final = 1
 PASS_ON: Final = 2
+LOOK: Final = 3
 """What becomes of a frame at an acceptance filter (`Node.filters`)."""
 
 NO_FILTER: Final = 0x800
@@ -108,10 +109,16 @@ class Relay(Node):
     """A node with two ports, 0 and 1, that passes most frames on from one to the other, at once and unchanged.
 
     frames: received so far, by port. filters: PASS_ON where all that `receive` does with a base data frame is to count
-    it in `frames` and send it on the other port; a loop may do that in its stead, without making a Frame.
+    it in `frames` and send it on the other port; a loop may do that in its stead, without making a Frame. LOOK where
+    `receive` also does what `look` does, and nothing else.
     """
 
     def __init__(self) -> None:
         super().__init__()
         self.frames: list[int] = [0, 0]
         self.filters = [open_filter(), open_filter()]
+
+    def look(self, now: int, port: int, can_id: int) -> None:
+        """A base data frame with this id came on `port` at `now`, and the loop has passed it on. Must ask for nothing:
+        no other `wake_at`, no other filters. In the order of the frames of a port; of two ports, perhaps not.
+        """

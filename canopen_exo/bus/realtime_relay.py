@@ -1,10 +1,10 @@
 """The short way through the real-time loop: what a Relay only passes on goes as the record that came.
 
 Two channels that carry records, and a node that says which COB-IDs it has nothing to do with (`Relay`): runs of
-such frames go out of the buffers they were read into, many with one call, and nothing is made of them. A frame between
-them is made and given to the node. What the node sees, and when, is as if it had been given all of them, and so is what
-goes out on each bus; only what the node adds to one direction because of a frame from the other one may go before
-frames that had come in the same turn.
+such frames go out of the buffers they were read into, many with one call, and nothing is made of them. Those that it
+only looks at go with them, and it is told when they came. Any other frame is made and given to the node. What the node
+sees of a port, and when, is as if it had been given all of them, and so is what goes out on each bus; only what the
+node adds to one direction because of a frame from the other one may go before frames that had come in the same turn.
 As soon as something is in the way, the loop serves what is left frame by frame: another kind of frame or a notice has
 come, a wake-up is due among the frames, the relay filters otherwise than before, or a channel takes no more.
 """
@@ -13,7 +13,7 @@ from collections.abc import Callable
 from typing import Final, final
 
 from canopen_exo.bus.channel import Arrival, RecordChannel
-from canopen_exo.bus.node import NEVER, PASS_ON, Relay
+from canopen_exo.bus.node import LOOK, NEVER, PASS_ON, Relay
 from canopen_exo.bus.realtime_out import Line, RealTimeOut
 
 _PLACES: Final = (0, 1)
@@ -49,6 +49,7 @@ class ShortCut:
         self._clock: Final = clock
         self._measure: Final[bool] = measure
         self._passed: Final[list[tuple[int, int, int, int]]] = []  # place, first, end, and when: not accounted for yet
+        self._since: int = -NEVER  # served_ns as this turn began
         self._at: Final[list[int]] = [0, 0]  # by place: how many of those that came have been served
         self._ends: Final[list[int]] = [0, 0]
 
@@ -56,6 +57,7 @@ class ShortCut:
         """Read what has come and serve it; what is left, by place."""
         at, ends = self._at, self._ends
         at[0] = at[1] = 0
+        self._since = self._out.served_ns
         is_plain = True
         plain: list[RecordChannel] = []
         for place, line, channel in self._ways:
@@ -73,6 +75,9 @@ class ShortCut:
         for channel in plain:
             channel.stamp()
             latest = max(latest, channel.stamps[-1])
+        for place in _PLACES:
+            if at[place]:
+                self._look(place, 0, at[place])
         if is_plain:
             if at != ends:
                 self._serve_runs(latest)
@@ -94,11 +99,11 @@ class ShortCut:
         table = relay.filters[place]
         limit = 0
         for one in self._channels[place].ids:
-            if table[one] != PASS_ON:
+            if table[one] < PASS_ON:
                 break
             limit += 1
         if limit and not self._lines[1 - place].waiting and relay.wake_at > self._clock() + _NEAR_NS:
-            self._pass_on(place, limit)
+            self._send(place, limit)
 
     def _serve_runs(self, latest: int) -> None:
         """Base data frames alone, until all are served or something is in the way. latest: of their stamps."""
@@ -108,7 +113,7 @@ class ShortCut:
         for place, _, channel in self._ways:
             if at[place] < ends[place]:
                 for number, action in enumerate(map(filters[place].__getitem__, channel.ids)):
-                    if action != PASS_ON and number >= at[place]:
+                    if action < PASS_ON and number >= at[place]:
                         stops.append((channel.stamps[number], place, number))
         if ends[0] and ends[1]:
             stops.sort()
@@ -129,7 +134,22 @@ class ShortCut:
         return relay.filters == filters
 
     def _pass_on(self, place: int, limit: int) -> bool:
-        """Send what came on a channel up to `limit` on the other one; False when that did not take all of it."""
+        """Send what came on a channel up to `limit`, and let the node look; False when not all of it has gone."""
+        start = self._at[place]
+        self._send(place, limit)
+        self._look(place, start, self._at[place])
+        return self._at[place] == limit
+
+    def _look(self, place: int, start: int, end: int) -> None:
+        """Tell the node of those frames that it wants to know of."""
+        table = self._relay.filters[place]
+        channel = self._channels[place]
+        for number, can_id in enumerate(channel.ids[start:end], start):
+            if table[can_id] == LOOK:
+                self._relay.look(max(channel.stamps[number], self._since), place, can_id)
+
+    def _send(self, place: int, limit: int) -> None:
+        """Send what came on a channel up to `limit` on the other one, as far as that takes it."""
         source = self._channels[place]
         start = self._at[place]
         end = start + self._channels[1 - place].send_run(source, start, limit)
@@ -137,7 +157,6 @@ class ShortCut:
         self._relay.frames[place] += end - start
         if self._measure:
             self._passed.append((place, start, end, self._clock()))
-        return end == limit
 
     def _account(self) -> None:
         """Note how long what has passed was under way; no frame waits for this."""

@@ -6,11 +6,11 @@ from hypothesis import strategies as st
 
 from canopen_exo.bus.channel import Arrival, RecordChannel
 from canopen_exo.bus.frame import FLAG_EXTENDED, Frame
-from canopen_exo.bus.node import NEVER, PASS_ON, TAKE, ErrorState, Out, PortState, Relay
+from canopen_exo.bus.node import LOOK, NEVER, PASS_ON, TAKE, ErrorState, Out, PortState, Relay
 from canopen_exo.bus.realtime import RealTimeLoop
 
-LOOKED_AT, CALMING = 1, 2
-"""Ids the node wants to see. It sees all while a port is bus-off, up to the next frame with the last one."""
+TAKEN, CALMING, GLANCED_AT = 1, 2, 3
+"""Ids the node wants to see. It takes all while a port is bus-off, up to the next frame with the second one."""
 
 
 class FakeRecordChannel(RecordChannel):
@@ -72,37 +72,48 @@ class FakeRecordChannel(RecordChannel):
 
 
 class Diarist(Relay):
-    """Passes frames on, writes down what it has to look at, and is woken at `wake_at` and every 10 ns from then."""
+    """Passes frames on, writes down what it takes, and is woken at `wake_at` and every 10 ns from then.
+
+    seen: what it took, by port and then in all; of what it looks at the first alone.
+    """
 
     def __init__(self, wake_at: int) -> None:
         super().__init__()
         self.wake_at = wake_at
-        self.seen: list[tuple[int, int]] = []
-        self.sees_all = False
+        self.seen: list[list[tuple[int, int]]] = [[], [], []]
+        self.takes_all = False
         self.filter()
 
     def filter(self) -> None:
         for port in (0, 1):
             for can_id in range(0x10):
-                is_looked_at = self.sees_all or can_id in (LOOKED_AT, CALMING)
-                self.filters[port][can_id] = TAKE if is_looked_at else PASS_ON
+                is_taken = self.takes_all or can_id in (TAKEN, CALMING)
+                passing = LOOK if can_id == GLANCED_AT else PASS_ON
+                self.filters[port][can_id] = TAKE if is_taken else passing
+
+    def look(self, now: int, port: int, can_id: int) -> None:
+        assert can_id == GLANCED_AT
+        self.seen[port].append((now, can_id))
 
     def receive(self, now: int, port: int, frame: Frame, out: Out) -> None:
         self.frames[port] += 1
-        if self.sees_all or frame.can_id in (LOOKED_AT, CALMING) or frame.flags:
-            self.seen.append((now, frame.can_id))
+        if frame.can_id == GLANCED_AT and not frame.flags:
+            self.seen[port].append((now, frame.can_id))
+        elif self.takes_all or frame.can_id in (TAKEN, CALMING) or frame.flags:
+            for seen in (self.seen[port], self.seen[2]):
+                seen.append((now, frame.can_id))
         if frame.can_id == CALMING:
-            self.sees_all = False
+            self.takes_all = False
             self.filter()
         out.send(1 - port, frame)
 
     def wake(self, now: int, out: Out) -> None:
-        self.seen.append((now, -1))
+        self.seen[2].append((now, -1))
         self.wake_at += 10
 
     def port_changed(self, now: int, state: PortState, out: Out) -> None:
-        self.seen.append((now, -2 - state.port))
-        self.sees_all = state.state is ErrorState.BUS_OFF
+        self.seen[2].append((now, -2 - state.port))
+        self.takes_all = state.state is ErrorState.BUS_OFF
         self.filter()
 
 
@@ -177,12 +188,12 @@ def test_runs_of_records_are_served_as_frames_are(
     assert served(first, second, takes, False, NEVER) == served(first, second, takes, True, NEVER)
 
 
-def outcome(kinds: list[Frame], wake_at: int, sees_all: bool = False) -> tuple[int, int]:
+def outcome(kinds: list[Frame], wake_at: int, takes_all: bool = False) -> tuple[int, int]:
     """How many of those that come at 0, 1, ... ns go out on the other channel, and how many of them as records."""
     channels = [FakeRecordChannel(10, 100), FakeRecordChannel(11, 100)]
     channels[0].inbox = list(enumerate(kinds))
     node = Diarist(wake_at)
-    node.sees_all = sees_all
+    node.takes_all = takes_all
     node.filter()
     loop = RealTimeLoop(
         node, list(channels), [0, 1], 0, clock=lambda: 12, wait=lambda readers, writers, _: (readers, writers)
@@ -201,8 +212,10 @@ def base(*ids: int) -> list[Frame]:
     [
         (base(7, 8), NEVER, 2),
         (base(7), NEVER, 1),
-        (base(LOOKED_AT), NEVER, 0),
-        (base(7, LOOKED_AT, 7, 8), NEVER, 3),
+        (base(TAKEN), NEVER, 0),
+        (base(GLANCED_AT, 7), NEVER, 2),
+        (base(TAKEN, GLANCED_AT), NEVER, 1),
+        (base(7, TAKEN, 7, 8), NEVER, 3),
         (base(7, CALMING, 7, 8), NEVER, 3),
         (base(7, 8), 1, 2),  # at one instant a frame comes before a wake-up
         (base(7, 8), 0, 0),  # a wake-up that is due between them
@@ -213,4 +226,4 @@ def test_only_what_the_node_does_not_want_goes_as_a_record(kinds: list[Frame], w
     """What is looked at, of another kind or comes with a wake-up that is due is handled; or all are."""
     assert outcome(kinds, wake_at) == (len(kinds), records)
     if CALMING not in [frame.can_id for frame in kinds]:
-        assert outcome(kinds, wake_at, sees_all=True) == (len(kinds), 0)
+        assert outcome(kinds, wake_at, takes_all=True) == (len(kinds), 0)
