@@ -10,7 +10,7 @@ import subprocess
 import sys
 from collections import deque
 from collections.abc import Callable
-from typing import Final, final
+from typing import IO, Final, Protocol, final
 
 from testbench.errors import BenchError
 
@@ -21,6 +21,38 @@ class ProcessError(BenchError):
     """A process did not become ready, or ended unasked; the message has its last lines."""
 
 
+class Running(Protocol):
+    """What there is to a process that was started, as in `subprocess.Popen`."""
+
+    @property
+    def pid(self) -> int:
+        """Its process id."""
+
+    @property
+    def stdout(self) -> IO[bytes] | None:
+        """Its output."""
+
+    def poll(self) -> int | None:
+        """Exit code, -N when signal N killed it; None while it runs."""
+
+    def wait(self, timeout: float | None = None) -> int:
+        """The same at its end; raises TimeoutExpired when that takes longer [s]."""
+
+    def send_signal(self, sig: int) -> None:
+        """Nothing happens when it has ended."""
+
+
+def execute(arguments: list[str]) -> Running:
+    """`exo-hil` with these arguments, from nothing."""
+    return subprocess.Popen(
+        [sys.executable, "-P", "-m", "testbench.cli", *arguments],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        start_new_session=True,
+    )
+
+
 @final
 class Process:
     """A running process. name: hub or one of PARTS; lines: the last ones it printed. Its output is read by `listen`.
@@ -28,7 +60,7 @@ class Process:
     say: told each line as it comes, None where nobody shows them.
     """
 
-    def __init__(self, name: str, arguments: list[str], say: Callable[[str], None] | None) -> None:
+    def __init__(self, name: str, running: Running, say: Callable[[str], None] | None) -> None:
         self.name: Final[str] = name
         self.lines: Final[deque[str]] = deque(maxlen=_LAST_LINES)
         self.is_told: bool = False
@@ -36,13 +68,7 @@ class Process:
         self._say: Final[Callable[[str], None] | None] = say
         self._rest: bytes = b""
         self._is_closed: bool = False
-        self._running: Final[subprocess.Popen[bytes]] = subprocess.Popen(
-            [sys.executable, "-P", "-m", "testbench.cli", *arguments],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            start_new_session=True,
-        )
+        self._running: Final[Running] = running
         os.set_blocking(self.fileno(), False)
 
     @property

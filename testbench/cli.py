@@ -122,6 +122,11 @@ def _run(options: argparse.Namespace) -> int:
     In virtual time, or with --realtime as processes against the clock, on an own hub or on the buses named. With
     --replay the faults of a result folder act again when and as long as they did, whatever started them.
     """
+    if options.realtime:
+        from testbench import fork_server
+
+        fork_server.shared()  # it imports meanwhile
+
     from fi_gateway.errors import FaultError
     from fi_gateway.marked_yaml import FileErrors
     from fi_gateway.schema import refuse_wire_faults

@@ -348,6 +348,10 @@ def _fault(options: argparse.Namespace) -> int:
 
 def _up(options: argparse.Namespace) -> int:
     """Start hub, joints, gateway and controller, walk until Ctrl-C, and stop them in order."""
+    from testbench import fork_server
+
+    fork_server.shared()  # it imports meanwhile
+
     from canopen_exo.errors import CanopenExoError
     from fi_gateway.errors import FaultError
     from fi_gateway.schema import refuse_wire_faults

@@ -26,7 +26,8 @@ from canopen_exo.bus.realtime import RealTimeLoop
 from canopen_exo.emcy import error_words
 from fi_gateway.control_address import is_path, remove_left
 from fi_gateway.schema import status_watchers
-from testbench.child import Process, ProcessError
+from testbench import fork_server
+from testbench.child import Process, ProcessError, Running, execute
 from testbench.errors import BenchError, RefusedError
 from testbench.process import DONE, ENDED_EARLY, Orders, open_bus
 from testbench.scenario import Scenario
@@ -157,6 +158,7 @@ class Supervisor:
         asked to end meanwhile.
         """
         setup = self.setup
+        fork_server.shared()  # it imports meanwhile
         self._scenario_file.write_text(setup.scenario.resolved_yaml(), encoding="utf-8")
         if setup.buses is None and not self._hub_address:
             self.start_hub()
@@ -175,8 +177,7 @@ class Supervisor:
     def start_hub(self) -> None:
         """The hub alone, without listening on its buses; `start` does it where none are named. Raises as `start`."""
         bitrate = str(self.setup.scenario.plan.bitrate)
-        arguments = ["--timed", "--listen", self.setup.listen, "--bitrate", bitrate, *self._supervised()]
-        hub = self._spawn("hub", arguments)
+        hub = self._spawn("hub", ["--timed", "--listen", self.setup.listen, "--bitrate", bitrate])
         limit = self.now() + READY_NS
         while not self._hub_address:
             self._check_orders()
@@ -300,22 +301,28 @@ class Supervisor:
         return Path(self._temporary.name) / "scenario.yaml"
 
     def _common(self, name: str) -> list[str]:
-        arguments = [str(self._scenario_file), "--epoch", str(self._epoch_ns), *self._supervised()]
+        arguments = [str(self._scenario_file), "--epoch", str(self._epoch_ns)]
         if self.setup.keep_parts:
             arguments += ["--part", str(self.part(name))]
         return arguments + (["--fifo"] if self.setup.fifo else [])
 
-    def _supervised(self) -> list[str]:
-        """Who supervises, and what to remove when he is gone."""
-        return ["--supervisor", str(os.getpid()), "--folder", self._temporary.name]
-
     def _spawn(self, name: str, arguments: list[str]) -> Process:
         self._check_orders()
-        process = Process(name, [name, *arguments], self._say)
+        process = Process(name, self._launch(name, arguments), self._say)
         self.processes[name] = process
         if self._loop is not None:
             self._loop.add_reader(process, lambda now: self._hear(process))
         return process
+
+    def _launch(self, name: str, arguments: list[str]) -> Running:
+        """Forked where that can be, but for the hub, which imports little and comes first.
+
+        It is told who its parent is, and what to remove when that is gone.
+        """
+        forks = None if name == "hub" else fork_server.shared()
+        given = [name, *arguments, "--folder", self._temporary.name, "--supervisor"]
+        forked = None if forks is None else forks.fork([*given, str(forks.pid)])
+        return execute([*given, str(os.getpid())]) if forked is None else forked
 
     def _hear(self, process: Process) -> None:
         if not process.listen() and self._loop is not None:
