@@ -16,7 +16,7 @@ PYTEST := $(BIN)/python -m pytest -rs
 REPORTS := build/reports
 
 # What a user's shell has set must not reach into the virtual environment.
-unexport PYTHONPATH PYTHONHOME PYTHONSTARTUP PYTHONOPTIMIZE PIP_USER PIP_TARGET PIP_PREFIX PIP_REQUIRE_VIRTUALENV
+unexport PYTHONPATH PYTHONHOME PYTHONSTARTUP PYTHONOPTIMIZE PYTHONDONTWRITEBYTECODE PIP_USER PIP_TARGET PIP_PREFIX PIP_REQUIRE_VIRTUALENV
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export MPLCONFIGDIR := $(CURDIR)/.cache/matplotlib
 
@@ -58,10 +58,8 @@ demo: $(READY) ## a frozen knee encoder, with its verdict (pass and fail are bot
 	echo "traces and plots: results/demo"
 
 test: $(READY) ## all of the next six, whatever fails on the way; says last what failed, how many were skipped, and why
-	@rm -rf $(REPORTS); failed=; \
-	for part in lint unit runs realtime vcan compile; do \
-	  $(MAKE) --no-print-directory $$part || failed="$$failed $$part"; done; \
-	$(BIN)/python -m tests.summary --failed "$$failed" $(foreach part,unit runs realtime vcan,$(REPORTS)/$(part).xml)
+	@rm -rf $(REPORTS)
+	@$(BIN)/python -m tests.recipes $(MAKE) $(REPORTS)
 
 lint: $(READY) ## ruff, mypy --strict, import contracts
 	$(BIN)/python -m ruff check .
@@ -72,7 +70,7 @@ unit: $(READY) ## the tests that need no whole run and no clock, on WORKERS=2 pr
 	$(PYTEST) -n $(WORKERS) -m "not run and not long and not realtime" --ignore=tests/vcan --junitxml=$(REPORTS)/$@.xml
 
 runs: $(READY) ## whole runs in virtual time, the examples, and laws that take long, on WORKERS=2 processes
-	$(PYTEST) -n $(WORKERS) -m "run or long" --ignore=tests/vcan --junitxml=$(REPORTS)/$@.xml
+	$(PYTEST) -n $(WORKERS) --dist loadfile -m "run or long" --ignore=tests/vcan --junitxml=$(REPORTS)/$@.xml
 
 realtime: $(READY) ## rigs of processes against the clock, one at a time, on the hub; a machine too busy for them skips
 	$(PYTEST) -m realtime --ignore=tests/vcan --junitxml=$(REPORTS)/$@.xml

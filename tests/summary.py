@@ -1,20 +1,15 @@
 """The last lines of `make test`: how many tests passed, how many were skipped, and why.
 
-    python -m tests.summary --failed "lint vcan" build/reports/unit.xml ...
-
-Reads the JUnit files that the recipes have pytest write; exit 1 when one is missing or tells of a failure, and when a
-recipe failed.
+Read from the JUnit files that the recipes have pytest write; all is not well when one is missing or tells of a failure,
+and when a recipe failed.
 """
 
-import argparse
-import sys
 import xml.etree.ElementTree as ET
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from benchmarks.compile_core import no_compiler
 from tests.parity.patience import BUSY
 
 WIDTH: Final = 240
@@ -51,18 +46,3 @@ def summarise(reports: list[Path], no_compiled_build: str | None, failed: Sequen
         more = " ..." if len(reason) > WIDTH else ""
         lines.append(f"  skipped {count}: {reason[:WIDTH]}{more}")
     return lines + problems, not problems
-
-
-def main() -> int:
-    """Print it."""
-    parser = argparse.ArgumentParser(description="the last lines of `make test`")
-    parser.add_argument("--failed", default="", metavar="RECIPES", help="those that failed, with spaces between them")
-    parser.add_argument("reports", nargs="+", type=Path, help="JUnit files")
-    given = parser.parse_args()
-    lines, is_well = summarise(given.reports, no_compiler(), given.failed.split())
-    print("\n".join(lines))
-    return 0 if is_well else 1
-
-
-if __name__ == "__main__":
-    sys.exit(main())

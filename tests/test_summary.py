@@ -7,11 +7,12 @@ from pathlib import Path
 import pytest
 
 from tests.parity.patience import BUSY
+from tests.recipes import ON_ALL, ON_ONE, VCAN, run_all
 from tests.summary import WIDTH, summarise
 
 ROOT = Path(__file__).resolve().parent.parent
 
-PARTS = ("lint", "unit", "runs", "realtime", "vcan", "compile")
+PARTS = (*ON_ONE, *ON_ALL, VCAN)
 
 TESTS = f'''
 import pytest
@@ -68,14 +69,27 @@ def test_recipe_that_failed_is_told_and_no_success(report: Path) -> None:
     assert lines[-2:] == ["make lint failed", "make compile failed"]
 
 
-def test_recipes_go_on_after_one_that_failed(tmp_path: Path) -> None:
-    """`make test` runs all of them whatever fails, and fails in the end."""
-    rule = (ROOT / "Makefile").read_text().split("\ntest: ")[1].split("\n\n")[0].replace("$(READY)", "")
-    recipes = "\n".join(f"{one}:\n\t@echo ran $@; {'false' if one == 'unit' else 'true'}" for one in PARTS)
-    (tmp_path / "Makefile").write_text(f"BIN := .\nREPORTS := reports\ntest: {rule}\n{recipes}\n")
-    (tmp_path / "python").write_text('#!/bin/sh\necho "$@"\ncase "$4" in "") exit 0;; *) exit 1;; esac\n')
-    (tmp_path / "python").chmod(0o755)
-    ended = subprocess.run(["make", "test"], cwd=tmp_path, capture_output=True, text=True, timeout=60)
-    assert [line for line in ended.stdout.splitlines() if line.startswith("ran ")] == [f"ran {one}" for one in PARTS]
-    assert ended.returncode != 0
-    assert "--failed  unit reports/unit.xml" in ended.stdout
+@pytest.mark.parametrize(("beside", "order"), [(False, PARTS), (True, (*ON_ONE, VCAN, *ON_ALL))])
+@pytest.mark.parametrize("bad", PARTS)
+def test_recipes_go_on_after_one_that_failed(
+    tmp_path: Path,
+    capfd: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    beside: bool,
+    order: tuple[str, ...],
+    bad: str,
+) -> None:
+    """`make test` runs all of them whatever fails; what ran beside others is shown whole, when it has ended."""
+    recipes = "\n".join(f"{one}:\n\t@echo ran $@; {'false' if one == bad else 'true'}" for one in PARTS)
+    (tmp_path / "Makefile").write_text(recipes)
+    monkeypatch.chdir(tmp_path)
+    assert run_all("make", tmp_path / "vcan.log", beside) == [bad]
+    said = [line for line in capfd.readouterr().out.splitlines() if line.startswith("ran ")]
+    assert said == [f"ran {one}" for one in order]
+
+
+def test_the_parts_are_recipes_of_the_makefile() -> None:
+    """And `make test` runs them."""
+    makefile = (ROOT / "Makefile").read_text()
+    assert all(f"\n{one}: " in makefile for one in PARTS)
+    assert "python -m tests.recipes $(MAKE) $(REPORTS)" in makefile
