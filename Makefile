@@ -14,6 +14,7 @@ RECENT := import sys; sys.exit(sys.version_info < (3, 11))
 # A part of the tests says which ones it skipped and why, and leaves a report for the last lines of `make test`.
 PYTEST := $(BIN)/python -m pytest -rs
 REPORTS := build/reports
+THIS_MAKE := $(MAKE) # by another name, so that `make -n` does not run it
 
 # What a user's shell has set must not reach into the virtual environment.
 unexport PYTHONPATH PYTHONHOME PYTHONSTARTUP PYTHONOPTIMIZE PYTHONDONTWRITEBYTECODE PIP_USER PIP_TARGET PIP_PREFIX PIP_REQUIRE_VIRTUALENV
@@ -58,8 +59,7 @@ demo: $(READY) ## a frozen knee encoder, with its verdict (pass and fail are bot
 	echo "traces and plots: results/demo"
 
 test: $(READY) ## all of the next six, whatever fails on the way; says last what failed, how many were skipped, and why
-	@rm -rf $(REPORTS)
-	@$(BIN)/python -m tests.recipes $(MAKE) $(REPORTS)
+	@$(BIN)/python -m tests.recipes $(THIS_MAKE) $(REPORTS)
 
 lint: $(READY) ## ruff, mypy --strict, import contracts
 	$(BIN)/python -m ruff check .

@@ -131,6 +131,7 @@ class Process:
         if self.code is None:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(self.pid, signal.SIGKILL)
+            self._running.send_signal(signal.SIGKILL)  # also when it has no session of its own yet
         self._running.wait()
         self.listen()
         self._is_closed = True

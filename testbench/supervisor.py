@@ -158,7 +158,8 @@ class Supervisor:
         asked to end meanwhile.
         """
         setup = self.setup
-        fork_server.shared()  # it imports meanwhile
+        if set(parts) - setup.without:
+            fork_server.shared()  # it imports meanwhile
         self._scenario_file.write_text(setup.scenario.resolved_yaml(), encoding="utf-8")
         if setup.buses is None and not self._hub_address:
             self.start_hub()
@@ -321,8 +322,18 @@ class Supervisor:
         """
         forks = None if name == "hub" else fork_server.shared()
         given = [name, *arguments, "--folder", self._temporary.name, "--supervisor"]
-        forked = None if forks is None else forks.fork([*given, str(forks.pid)])
+        forked = None if forks is None else forks.fork([*given, str(forks.pid)], self._pause)
         return execute([*given, str(os.getpid())]) if forked is None else forked
+
+    def _pause(self) -> None:
+        """One short turn of waiting for something that is not ours to hear."""
+        self._check_orders()
+        loop = self._loop
+        if loop is None or not self._channels:
+            time.sleep(_LOOK_NS / SECOND)
+        else:
+            limit = loop.now() + _LOOK_NS
+            loop.run(lambda now: now >= limit)
 
     def _hear(self, process: Process) -> None:
         if not process.listen() and self._loop is not None:

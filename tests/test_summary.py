@@ -1,11 +1,15 @@
 """What `make test` says last."""
 
+import os
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
 
+from tests import recipes
 from tests.parity.patience import BUSY
 from tests.recipes import ON_ALL, ON_ONE, VCAN, run_all
 from tests.summary import WIDTH, summarise
@@ -92,4 +96,68 @@ def test_the_parts_are_recipes_of_the_makefile() -> None:
     """And `make test` runs them."""
     makefile = (ROOT / "Makefile").read_text()
     assert all(f"\n{one}: " in makefile for one in PARTS)
-    assert "python -m tests.recipes $(MAKE) $(REPORTS)" in makefile
+    assert "python -m tests.recipes $(THIS_MAKE) $(REPORTS)" in makefile
+
+
+@pytest.mark.parametrize(("failed", "reported", "code"), [([], PARTS, 0), (["lint"], PARTS, 1), ([], ("unit",), 1)])
+def test_exit_code_is_0_when_all_went_well(
+    tmp_path: Path, report: Path, monkeypatch: pytest.MonkeyPatch, failed: list[str], reported: list[str], code: int
+) -> None:
+    """A recipe that fails and a report that is not there are failures; what lay there before does not count."""
+    reports = tmp_path / "reports"
+    reports.mkdir()
+    for name in PARTS:
+        (reports / f"{name}.xml").write_text("of an earlier run")
+
+    def run_them(make: str, log: Path, beside: bool) -> list[str]:
+        assert list(reports.iterdir()) == []
+        for name in reported:
+            (reports / f"{name}.xml").write_bytes(report.read_bytes())
+        return failed
+
+    monkeypatch.setattr(recipes, "run_all", run_them)
+    monkeypatch.setattr(sys, "argv", ["recipes", "make", str(reports)])
+    assert recipes.main() == code
+
+
+@pytest.mark.parametrize("beside", [False, True])
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_recipes_end_before_it_does(tmp_path: Path, number: int, code: int, beside: bool) -> None:
+    """Ctrl-C reaches all of them, SIGTERM this one alone: none is left, and what they said is shown."""
+    work = "@trap 'kill $$!; sleep 0.3; echo ended $@; exit 1' INT TERM; sleep 60 & echo begun $@; wait"
+    (tmp_path / "Makefile").write_text(f"lint vcan:\n\t{work}\n")
+    program = (
+        "import sys; from tests import recipes\n"
+        f"recipes.can_be_beside = lambda: {beside}\n"
+        "sys.argv = ['recipes', 'make', 'reports']; sys.exit(recipes.main())"
+    )
+    asked = subprocess.Popen(
+        [sys.executable, "-c", program],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+        start_new_session=True,
+    )
+    wanted = {"lint", "vcan"} if beside else {"lint"}
+    log = tmp_path / "reports" / "vcan.log"
+    deadline = time.monotonic() + 60
+    with asked:
+        assert asked.stdout is not None
+        while asked.stdout.readline() != "begun lint\n":
+            assert time.monotonic() < deadline
+        while beside and (not log.exists() or "begun" not in log.read_text()):
+            assert time.monotonic() < deadline
+        if number == signal.SIGINT:
+            os.killpg(asked.pid, number)
+        else:
+            os.kill(asked.pid, number)
+        said = asked.stdout.read().splitlines()
+    assert asked.returncode == code
+    assert {line.removeprefix("ended ") for line in said if line.startswith("ended ")} == wanted
+
+
+def test_flags_of_the_make_that_called_go_on_but_for_its_job_server() -> None:
+    given = ["w", "-j2", "--jobserver-auth=3,4", "--", "PYTHON=python3.12"]
+    assert recipes.flags(given) == ["w", "--", "PYTHON=python3.12"]

@@ -5,12 +5,16 @@ import copy
 import pytest
 
 from canopen_exo.bus.frame import FLAG_BRS, FLAG_EXTENDED, FLAG_FD, FLAG_REMOTE, Frame
-from canopen_exo.bus.node import MS, NEVER, SECOND
+from canopen_exo.bus.node import LOOK, MS, NEVER, PASS_ON, SECOND, TAKE, ErrorState, PortState
+from canopen_exo.plan import SYNC
 from fi_gateway.effects import ConstantTime, Infinite
-from fi_gateway.events import At
+from fi_gateway.events import At, Never
 from fi_gateway.faults import Bias, Drop, StuckAtValue
-from fi_gateway.gateway import CONTROLLER_PORT, DRIVE_PORT, Gateway
-from fi_gateway.injector import Target
+from fi_gateway.gateway import CONTROLLER_PORT, DRIVE_PORT, CommandPort, Gateway
+from fi_gateway.injector import Injector, Target
+from fi_gateway.on_wire import Disturbed
+from fi_gateway.trigger import BusFrame, Trigger
+from fi_gateway.wire_faults import StuckDominant
 from tests.fi_gateway.gateway_at_zero import (
     CYCLE,
     POSITION,
@@ -35,6 +39,69 @@ def test_without_injectors_every_frame_comes_out_on_the_other_port(port: int, ca
     gateway, frame = Gateway([], CYCLE), Frame(can_id, b"\x01\x02")
     assert pass_through(gateway, 5, frame, port) is frame
     assert gateway.frames[port] == 1
+
+
+def sync_filters(gateway: Gateway) -> tuple[int, int]:
+    """What becomes of a SYNC from the controller, and of one from the drives."""
+    return gateway.filters[CONTROLLER_PORT][SYNC], gateway.filters[DRIVE_PORT][SYNC]
+
+
+AT_SYNC = Target(False, True, (SYNC,))
+
+
+@pytest.mark.parametrize(
+    ("injectors", "filters"),
+    [
+        ([], (LOOK, PASS_ON)),
+        ([injector(Drop(), At((0,)), Infinite())], (LOOK, PASS_ON)),
+        ([injector(Drop(), At((0,)), Infinite(), target=AT_SYNC)], (TAKE, PASS_ON)),
+        ([injector(Drop(), At((0,)), Infinite(), target=Target(True, False, (SYNC,)))], (LOOK, TAKE)),
+        ([injector(Drop(), Never(), Infinite(), trigger=Trigger(frame=BusFrame(SYNC, b"", b"", False, True)))],
+         (TAKE, PASS_ON)),
+        ([injector(Disturbed("drive", StuckDominant()), At((0,)), ConstantTime(MS))], (TAKE, PASS_ON)),
+    ],
+)  # fmt: skip
+def test_a_sync_that_is_only_read_for_its_time_need_not_be_handled(
+    injectors: list[Injector], filters: tuple[int, int]
+) -> None:
+    """It is handled where an injector, a trigger or a wire fault waits for what happens at that time."""
+    gateway = Gateway(injectors, CYCLE)
+    assert sync_filters(gateway) == filters
+    assert sync_filters(copy.deepcopy(gateway)) == filters
+
+
+def test_a_sync_that_is_looked_at_tells_time_0_as_one_that_is_handled() -> None:
+    handled, looked_at = Gateway([], CYCLE), Gateway([], CYCLE)
+    for number in range(3):
+        handled.receive(ZERO + number * CYCLE, CONTROLLER_PORT, Frame(SYNC, b"\x01"), Sink())
+        looked_at.look(ZERO + number * CYCLE, CONTROLLER_PORT, SYNC)
+    for gateway in (handled, looked_at):
+        gateway.receive(ZERO + 2 * CYCLE + 5, CONTROLLER_PORT, status(2, 2), Sink())
+    assert looked_at.time_zero == handled.time_zero == ZERO
+    assert vars(looked_at.cadence) == vars(handled.cadence)
+
+
+def test_from_power_up_a_sync_is_handled_while_it_may_be_the_first_frame() -> None:
+    gateway = Gateway([injector(Drop(), At((0,)), Infinite(), from_power_up=True)], CYCLE)
+    assert sync_filters(gateway) == (TAKE, TAKE)
+    gateway.receive(5, CONTROLLER_PORT, Frame(SYNC, b""), Sink())
+    assert sync_filters(gateway) == (LOOK, PASS_ON)
+
+
+def test_a_sync_is_handled_from_when_something_wants_it_on() -> None:
+    """While a port is away; when live control adds an injector there, or reads its commands there."""
+    gateway = Gateway([], CYCLE)
+    for state, filters in ((ErrorState.BUS_OFF, (TAKE, TAKE)), (ErrorState.ERROR_ACTIVE, (LOOK, PASS_ON))):
+        gateway.port_changed(5, PortState(DRIVE_PORT, state, 0, 0, "test"), Sink())
+        assert sync_filters(gateway) == filters
+    gateway.attach(CommandPort(DRIVE_PORT, SYNC))
+    assert sync_filters(gateway) == (LOOK, TAKE)
+    gateway = Gateway([], CYCLE)
+    gateway.attach(CommandPort(CONTROLLER_PORT, SYNC))
+    assert sync_filters(gateway) == (TAKE, PASS_ON)
+    gateway, _ = at(ZERO, [])
+    gateway.add(injector(Drop(), At((0,)), Infinite(), target=AT_SYNC), ZERO + 5)
+    assert sync_filters(gateway) == (TAKE, PASS_ON)
 
 
 FLAGGED = [

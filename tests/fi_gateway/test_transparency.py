@@ -209,6 +209,17 @@ def test_no_command_from_before_or_during_bus_off_comes_out_after_it(
         assert made.loop.losses() == len(before) + len(during)
 
 
+def test_time_0_is_told_by_a_sync_that_passes(bench: MakeBench) -> None:
+    """It is only looked at, and goes on with the others; the status frame behind it counts from when it came."""
+    with bench() as made:
+        sync, others = classical(0x080, b"\1"), [classical(0x200 + number, b"\0\0") for number in range(1, 7)]
+        begun = made.loop.now()
+        made.pass_all([[*others, sync, *others, sync, classical(0x2FF, struct.pack("<BHH", 2, 5, 0))], []], [0, 15])
+        assert made.came[DRIVE_PORT] == [*others, sync, *others, sync, classical(0x2FF, struct.pack("<BHH", 2, 5, 0))]
+        assert begun <= made.gateway.cadence.last <= made.loop.now()
+        assert made.gateway.time_zero == made.gateway.cadence.last - 5 * 2_000_000
+
+
 def test_latency_is_measured_for_every_frame_sent(bench: MakeBench) -> None:
     """From the stamp of the frame to its sending, by direction."""
     with bench() as made:

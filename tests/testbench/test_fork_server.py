@@ -1,6 +1,5 @@
 """Processes that are forked are as those started from nothing, and end with whoever has asked for them."""
 
-import contextlib
 import json
 import os
 import select
@@ -17,11 +16,13 @@ from testbench import fork_server
 from testbench.child import Process, Running, execute
 from testbench.cli_rig import DEFAULT_SCENARIO
 from testbench.fork_server import ForkServer
-from tests.parity.rigs import is_alive
+from tests.parity.rigs import descendants_of, ended, is_alive
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="processes are forked on Linux alone")
 
 PATIENCE_S = 60.0
+
+EXAMPLE = Path(__file__).parents[2] / "scenarios" / "golden.yaml"
 
 
 @pytest.fixture(scope="module")
@@ -122,16 +123,21 @@ def test_the_process_that_forks_has_one_thread(server: ForkServer) -> None:
 
 
 def test_a_server_that_is_killed_is_followed_by_another_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What it has forked counts as running for as long as it does; how it has ended nobody can tell then."""
     monkeypatch.setattr(fork_server, "_SHARED", [])
     first = fork_server.shared()
     assert first is not None
     assert fork_server.shared() is first
-    process = hub(first)
+    process, other = hub(first), hub(first)
     os.kill(first.pid, signal.SIGKILL)
+    process.wait(0.1)
+    codes = [process.code]  # told to end is one that has --supervisor
+    os.kill(process.pid, signal.SIGTERM)
     process.wait(PATIENCE_S)
-    assert process.code == -signal.SIGHUP
-    os.kill(process.pid, signal.SIGKILL)  # one with --supervisor gets SIGHUP
+    assert [*codes, process.code] == [None, -signal.SIGHUP]
     process.close()
+    other.close()
+    assert other.code is not None
     assert first.fork(["--version"]) is None
     second = fork_server.shared()
     assert second is not None
@@ -140,13 +146,63 @@ def test_a_server_that_is_killed_is_followed_by_another_one(monkeypatch: pytest.
     second.close()
 
 
+def test_a_server_that_would_find_other_packages_is_replaced(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Where an interpreter looks for packages is settled as it starts: fault types of users are among them."""
+    monkeypatch.setattr(fork_server, "_SHARED", [])
+    first = fork_server.shared()
+    (tmp_path / "numpy.py").write_text("raise ImportError('there is no numpy here')\n")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    second = fork_server.shared()
+    assert second is not None
+    assert second is not first
+    said, code = outcome(forked(second, "check", str(EXAMPLE)))
+    assert (code, "there is no numpy here" in said) == (3, True)
+    second.close()
+
+
+def test_signals_to_everybody_are_not_for_the_server(server: ForkServer) -> None:
+    """As a service manager sends them to all processes of a service: each of the others ends by itself, in order."""
+    outcome(forked(server, "--version"))
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        os.kill(server.pid, number)
+    process = hub(server)
+    assert server.is_there
+    process.tell(signal.SIGINT)
+    process.wait(PATIENCE_S)
+    process.close()
+    assert process.code == 0
+
+
+def test_who_is_interrupted_while_he_waits_gets_no_process(server: ForkServer) -> None:
+    """The server may take its time: a signal to whoever asks is heard meanwhile."""
+    outcome(forked(server, "--version"))
+    os.kill(server.pid, signal.SIGSTOP)
+
+    def interrupt() -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        server.fork(["hub", "--listen", "127.0.0.1:0"], interrupt)
+    os.kill(server.pid, signal.SIGCONT)
+    assert outcome(forked(server, "--version"))[1] == 0
+    deadline = time.monotonic() + PATIENCE_S
+    while descendants_of(server.pid) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert descendants_of(server.pid) == []
+
+
 def test_all_end_with_the_program_that_asked() -> None:
-    """Also when it is killed: the kernel closes its socket, the server ends, and that is told to what it has forked."""
+    """Also when it is killed, and a forked copy of it lives on: the kernel closes its socket, the server ends, and that
+    is told to what it has forked.
+    """
     program = (
-        "import json, time; from testbench.fork_server import shared; server = shared()\n"
+        "import os, sys, time; from testbench.fork_server import shared; server = shared()\n"
         "given = ['hub', '--listen', '127.0.0.1:0', '--supervisor', str(server.pid)]\n"
-        "one = server.fork(given); print(one.stdout.readline().decode().split()[0]); print(server.pid, one.pid)\n"
-        "import sys; sys.stdout.flush(); time.sleep(600)"
+        "one = server.fork(given); said = one.stdout.readline().decode().split()[0]\n"
+        "copy = os.fork()\n"
+        "if copy: print(said); print(server.pid, one.pid, copy)\n"
+        "else: assert shared() is not server\n"
+        "sys.stdout.flush(); time.sleep(600)"
     )
     with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as asking:
         assert asking.stdout is not None
@@ -154,12 +210,8 @@ def test_all_end_with_the_program_that_asked() -> None:
         pids = [int(word) for word in asking.stdout.readline().split()]
         assert all(map(is_alive, pids))
         asking.kill()
-    deadline = time.monotonic() + PATIENCE_S
-    while any(map(is_alive, pids)) and time.monotonic() < deadline:
-        time.sleep(0.01)
-    left = [pid for pid in pids if is_alive(pid)]
-    for pid in left:
-        with contextlib.suppress(ProcessLookupError):
+        left = [pid for pid in pids[:2] if not ended(pid, PATIENCE_S)]
+        for pid in (*left, pids[2]):
             os.kill(pid, signal.SIGKILL)
     assert not left
 
@@ -174,8 +226,18 @@ def test_a_request_that_is_cut_off_ends_the_server() -> None:
     server.close()
 
 
-def test_what_it_has_imported_is_what_the_processes_of_a_rig_import() -> None:
-    """Else each of them would take its time for it."""
+def test_a_working_directory_that_was_removed_is_no_obstacle(
+    server: ForkServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "gone"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    folder.rmdir()
+    assert outcome(forked(server, "--version"))[1] == 0
+
+
+def test_what_takes_longest_to_import_has_been_imported() -> None:
+    """Else each of the processes would take its time for it."""
     program = (
         "import importlib, json, sys; from testbench.fork_server import MODULES\n"
         "for name in MODULES: importlib.import_module(name)\n"

@@ -6,7 +6,6 @@ of their own plant, and everything else by what was heard.
 
 import os
 import re
-import select
 import signal
 import socket
 import struct
@@ -30,7 +29,7 @@ from testbench.process import DONE, ENDED_EARLY, LEAVE_NS
 from testbench.scenario import JOINT_NAMES, Scenario
 from testbench.supervisor import Setup, Supervisor
 from tests.parity.patience import Late, Patience, gave_up_late
-from tests.parity.rigs import LONG_NS, check_killed, heard, nothing_left, walk
+from tests.parity.rigs import LONG_NS, check_killed, descendants_of, ended, heard, nothing_left, walk
 from tests.parity.walks import Bench
 
 pytestmark = pytest.mark.realtime
@@ -68,32 +67,6 @@ def test_rig_told_to_end_leaves_the_drives_disabled(scenario: Scenario, patience
             return states
 
     assert patience.until_punctual(attempt) == {DriveState.SWITCH_ON_DISABLED}
-
-
-def descendants_of(pid: int) -> list[int]:
-    """Process ids, from /proc."""
-    found = []
-    for entry in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            fields = entry.read_text().rpartition(")")[2].split()
-        except OSError:  # it ended meanwhile
-            continue
-        if int(fields[1]) == pid:
-            child = int(entry.parent.name)
-            found += [child, *descendants_of(child)]
-    return found
-
-
-def ended(pid: int, timeout_s: float) -> bool:
-    """Wait until a process that is not ours has ended."""
-    try:
-        handle = os.pidfd_open(pid)
-    except ProcessLookupError:
-        return True
-    try:
-        return bool(select.select([handle], [], [], timeout_s)[0])
-    finally:
-        os.close(handle)
 
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="looks at /proc, and has the kernel tell")

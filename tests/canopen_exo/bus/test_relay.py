@@ -227,3 +227,17 @@ def test_only_what_the_node_does_not_want_goes_as_a_record(kinds: list[Frame], w
     assert outcome(kinds, wake_at) == (len(kinds), records)
     if CALMING not in [frame.can_id for frame in kinds]:
         assert outcome(kinds, wake_at, takes_all=True) == (len(kinds), 0)
+
+
+def test_time_does_not_go_back_for_what_is_looked_at() -> None:
+    """A frame that was stamped before those of the turn before were served, but was read after them."""
+    channels = [FakeRecordChannel(10, 100), FakeRecordChannel(11, 100)]
+    node = Diarist(NEVER)
+    loop = RealTimeLoop(
+        node, list(channels), [0, 1], 0, clock=lambda: 200, wait=lambda readers, writers, _: (readers, writers)
+    )
+    for port, stamp in ((0, 100), (1, 50), (1, 150)):
+        channels[port].inbox.append((stamp, Frame(GLANCED_AT, b"")))
+        turns = iter((False, True))
+        loop.run(lambda _: next(turns))  # noqa: B023 - it runs before the next turn
+    assert node.seen == [[(100, GLANCED_AT)], [(100, GLANCED_AT), (150, GLANCED_AT)], []]
