@@ -61,6 +61,7 @@ def test_the_fault_can_be_copied(module: ModuleType) -> None:
     assert twin.apply(0, joint(2**20, 7), OUT) == fault.apply(0, joint(2**20, 7), OUT)
 
 
+@pytest.mark.long
 def test_the_scenario_is_said_in_words(tmp_path: Path) -> None:
     """`exo-hil check` with a dotted path."""
     done = exo_hil(PACKAGE, "check", str(SCENARIO), cwd=tmp_path)

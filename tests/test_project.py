@@ -58,6 +58,7 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return target
 
 
+@pytest.mark.long
 def test_wheel_holds_every_file_of_the_packages_and_nothing_else(wheel: Path) -> None:
     """What works from the checkout works installed: modules, models, data and type markers are in the wheel."""
     names = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
@@ -74,6 +75,7 @@ def test_wheel_names_its_licence_and_carries_its_text(wheel: Path) -> None:
     assert b"Apache License" in licence
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("package", "folder", "ending"), [("dbc", ".", ".eds"), ("dbc", ".", ".dbc"), ("hlc", "data", ".csv")]
 )

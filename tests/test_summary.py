@@ -37,6 +37,7 @@ def report(tmp_path: Path) -> Path:
     return tmp_path / "some.xml"
 
 
+@pytest.mark.long
 def test_skipped_are_counted_with_their_reasons(report: Path) -> None:
     """Most frequent first, each in a line; those of a busy machine are counted by themselves."""
     lines, is_well = summarise([report, report], None)
@@ -47,6 +48,7 @@ def test_skipped_are_counted_with_their_reasons(report: Path) -> None:
     assert lines[2:] == ["  skipped 2: there is no such device here"]
 
 
+@pytest.mark.long
 def test_compiled_build_that_is_missing_counts_as_skipped(report: Path) -> None:
     """It is no pytest run, and part of `make test` all the same."""
     lines, _ = summarise([report], "there is no C compiler")
@@ -65,6 +67,7 @@ def test_part_that_failed_or_left_no_report_is_no_success(tmp_path: Path, conten
     assert str(path) in lines[-1]
 
 
+@pytest.mark.long
 def test_recipe_that_failed_is_told_and_no_success(report: Path) -> None:
     """Also one that leaves no report, such as lint; the counts are there all the same."""
     lines, is_well = summarise([report], None, ["lint", "compile"])

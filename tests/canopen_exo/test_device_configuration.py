@@ -241,6 +241,7 @@ FRAMES = st.one_of(
 GAPS = st.sampled_from([0, 0, 1, PERIOD, 7 * MS, 400 * MS])
 
 
+@pytest.mark.long
 @settings(max_examples=300)
 @given(frames=st.lists(st.tuples(GAPS, FRAMES), min_size=1, max_size=25))
 def test_no_frames_make_a_device_raise_or_break_its_rules(

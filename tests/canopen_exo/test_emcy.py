@@ -207,6 +207,7 @@ def test_no_error_that_finds_no_room_is_dropped_and_counted_too() -> None:
     assert NO_ERROR not in [code for k in range(20) for code, _ in sent(producer, k * 100 * MS)]
 
 
+@pytest.mark.long
 @given(
     inhibit=st.integers(0, 50),
     events=st.lists(st.tuples(st.integers(0, 30), st.integers(0, 3), st.booleans()), max_size=20)

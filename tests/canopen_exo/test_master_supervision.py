@@ -223,6 +223,7 @@ NOISE = st.one_of(
 )
 
 
+@pytest.mark.long
 @settings(max_examples=200)
 @given(
     noise=st.lists(st.tuples(st.sampled_from([0, 1, 100_000, CYCLE, 400 * MS]), NOISE), max_size=30),
@@ -249,6 +250,7 @@ def test_no_frames_make_the_master_raise(noise: list[tuple[int, tuple[int, bytes
     assert master.state in (MasterState.FAILED, MasterState.OPERATIONAL)
 
 
+@pytest.mark.long
 @settings(max_examples=60)
 @given(noise=st.lists(NOISE, max_size=30), first=st.integers(50, 60))
 def test_no_frames_stop_a_master_in_operation(noise: list[tuple[int, bytes, int]], first: int) -> None:

@@ -195,6 +195,7 @@ ALIGNED = [
 ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("fields", ALIGNED)
 @given(data=st.data())
 def test_struct_and_bit_codec_agree(data: st.DataObject, fields: list[tuple[int, bool]]) -> None:

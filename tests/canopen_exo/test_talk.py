@@ -5,7 +5,10 @@ import subprocess
 import sys
 import time
 
+import pytest
 
+
+@pytest.mark.long
 def test_result_waits_for_a_reader_that_is_slow_though_stdout_would_not_block() -> None:
     """Somebody else who has the pipe may have set it so; nothing is cut off and the exit code stays."""
     code = "import os; os.set_blocking(1, False); from canopen_exo.talk import show; show('x' * 1_000_000)"

@@ -215,6 +215,7 @@ def test_tpdos_are_decoded_by_the_canopen_package(position: int, velocity: int, 
     assert (node.tpdo[2][0x6041].raw, node.tpdo[2][0x6077].raw, node.tpdo[2][0x603F].raw) == (status, torque, 0)
 
 
+@pytest.mark.long
 @given(controlword=st.integers(0, 0xFFFF), torque=st.integers(-32768, 32767))
 def test_rpdo_of_the_canopen_package_reaches_the_objects_with_sync(controlword: int, torque: int) -> None:
     """Type 1: transmitted at once, applied with the next SYNC."""

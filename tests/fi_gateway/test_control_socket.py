@@ -306,6 +306,7 @@ def test_requests_sent_at_once_are_done_one_a_turn(bench: Bench) -> None:
     assert all(answer["ok"] for answer in (*bench.read(first), *bench.read(second)))
 
 
+@pytest.mark.long
 def test_a_client_that_never_reads_is_let_go_and_never_waited_for(bench: Bench) -> None:
     """Nothing here blocks the loop."""
     link = bench.connect()
@@ -322,6 +323,7 @@ def test_a_client_that_never_reads_is_let_go_and_never_waited_for(bench: Bench) 
     assert bench.say(bench.connect(), b'{"do": "stop"}\n')[0]["ok"]
 
 
+@pytest.mark.long
 @given(st.dictionaries(st.text(), st.recursive(st.none() | st.text() | st.integers(), st.lists, max_leaves=3)))
 def test_no_object_makes_the_gateway_raise(request_object: dict[str, object]) -> None:
     """Whatever comes from the network is data."""

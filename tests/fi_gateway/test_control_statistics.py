@@ -130,6 +130,7 @@ def test_changes_of_the_interfaces_are_told_with_their_times() -> None:
     ]
 
 
+@pytest.mark.long
 def test_a_bus_that_flaps_leaves_its_latest_changes() -> None:
     """Neither memory nor the answer to `list` grows without end, and what is told is not from days ago."""
     control, sink = live(), Sink()

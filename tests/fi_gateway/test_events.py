@@ -262,6 +262,7 @@ def walk(event: GaitPhase, last: int, stride: int = CYCLES, lost: frozenset[int]
     return found
 
 
+@pytest.mark.long
 @given(st.integers(0, 65535), st.sampled_from([750, 749, 100, 250, 1001]))
 def test_gait_phase_is_the_sync_nearest_to_it_in_every_stride(raw: int, stride: int) -> None:
     """Taken from the status frame and SYNC only; right on a SYNC, or within a cycle's half of it."""

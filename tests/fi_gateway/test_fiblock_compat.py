@@ -258,6 +258,7 @@ def test_mttr_of_03_s_gives_38_percent_of_faults_without_length() -> None:
     assert stats.binomtest(empty, n, share).pvalue > CHANCE
 
 
+@pytest.mark.long
 def test_repair_times_are_normal_with_a_sigma_of_1_s() -> None:
     """Of the faults that act, the number of samples follows from N(MTTR, 1 s), at whatever sample time."""
     n, mean_s, step_s = 3000, 5.0, 0.01
@@ -272,6 +273,7 @@ def test_repair_times_are_normal_with_a_sigma_of_1_s() -> None:
     assert abs(np.std(middle) - 1.0) < 5 / math.sqrt(2 * n)
 
 
+@pytest.mark.long
 def test_failure_times_are_normal_count_from_the_last_expiry_and_are_not_truncated() -> None:
     """N(MTTF, 1 s) to the first activation and again from each expiry; one below 0 comes at once."""
     n, mean_s, step_s = 1500, 1.0, 0.01

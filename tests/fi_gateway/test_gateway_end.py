@@ -168,6 +168,7 @@ def activations(probability: float, duration: int, until: int, seed: int) -> int
     return one.activated
 
 
+@pytest.mark.long
 def test_number_of_activations_is_the_renewal_count_with_dead_time() -> None:
     """5e-4 per 1 ms, 0.3 s, 7 s: n-th start = sum of n geometric gaps + 300 (n-1) ms, negative binomial (scipy).
 

@@ -164,6 +164,7 @@ PAIRS: Final = (
 )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("event", "effect"), PAIRS)
 @given(st.lists(st.integers(-5, 5), min_size=40, max_size=60), st.integers(0, 39))
 def test_a_snapshot_goes_on_alike(event: str, effect: str, positions: list[int], taken: int) -> None:

@@ -66,6 +66,7 @@ def test_every_kind_of_frame_passes_both_ways_byte_for_byte(bench: MakeBench) ->
         assert made.loop.losses() == 0
 
 
+@pytest.mark.long
 def test_armed_faults_elsewhere_change_nothing(bench: MakeBench) -> None:
     """A fault acts on classical data frames of its target; every other kind with the same id passes."""
     records = [record for record in kinds() if struct.unpack_from("=I", record)[0] != 0x185 or len(record) == 72]
@@ -108,6 +109,7 @@ def test_records_that_are_no_frames_are_counted_and_not_forwarded(bench: MakeBen
         assert made.channels[CONTROLLER_PORT].malformed == len(bad)
 
 
+@pytest.mark.long
 def test_bus_off_on_one_side_loses_what_is_sent_there_and_ends_by_itself(bench: MakeBench) -> None:
     """Counted as undelivered, nothing old comes out afterwards; the other direction goes on."""
     away = [classical(0x200 + number, bytes((number,))) for number in range(5)]
@@ -184,6 +186,7 @@ def test_a_bus_that_takes_only_some_of_many_frames_gets_all_of_them_in_order() -
         made.close()
 
 
+@pytest.mark.long
 def test_no_command_from_before_or_during_bus_off_comes_out_after_it(
     bench: MakeBench, readable_by_python: None
 ) -> None:
@@ -272,6 +275,7 @@ def test_an_interface_that_goes_away_and_comes_back_is_survived(
         trigger.close()
 
 
+@pytest.mark.long
 def test_no_frame_is_lost_doubled_or_moved_in_a_long_stream(bench: MakeBench) -> None:
     """None without a fault asking for it: 20 000 random frames, both ways; `make soak` takes 10 million."""
     chance = random.Random(11)

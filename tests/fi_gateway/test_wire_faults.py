@@ -209,6 +209,7 @@ def test_bus_off_takes_one_port_off() -> None:
     assert receiver.heard > 15
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("restart_ns", [0, 50 * MS])
 def test_port_does_not_leave_bus_off_while_the_bus_is_dominant(restart_ns: int) -> None:
     """There is no recessive bit, so none of the 128 sequences of 11, until the bus is free."""
@@ -390,6 +391,7 @@ def trace_of(windows: list[tuple[int, int, int]], told_before: bool) -> tuple[li
     return rows, [(port.tec, port.rec) for port in medium.ports]
 
 
+@pytest.mark.long
 @settings(max_examples=60, deadline=None)
 @given(
     st.lists(

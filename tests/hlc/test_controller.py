@@ -185,6 +185,7 @@ def test_before_the_fade_in_the_reference_is_upright_rest(controller: Controller
     assert controller.state.dq_d == [0.0] * 6
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("ahead", [0, 1, 2])
 def test_the_reference_agrees_with_itself(ahead: int) -> None:
     """dq_d at k is the slope of q_d; ddq_d at k is the slope of dq_d `ahead` cycles later.

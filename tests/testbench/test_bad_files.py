@@ -276,6 +276,7 @@ def test_override_mends_what_it_replaces(capsys: pytest.CaptureFixture[str]) -> 
     assert capsys.readouterr().err == ""
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "arguments",
     [["run", "bad.yaml"], ["check", "bad.yaml"], ["run", "good.yaml", "--seed", "x"], ["run"], ["walk"], []],

@@ -273,6 +273,7 @@ def test_version_is_the_projects(capsys: pytest.CaptureFixture[str]) -> None:
     assert shown(capsys, "--version") == f"exo-hil {project['version']}\n"
 
 
+@pytest.mark.long
 def test_reader_that_has_left_changes_nothing(place: Path) -> None:
     """`exo-hil export schema | head -1`: no traceback, the exit code of the verb."""
     command = [sys.executable, "-c", PROGRAM, "export", "schema"]

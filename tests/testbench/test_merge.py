@@ -39,6 +39,7 @@ def parts(rig: Rig) -> Parts:
     return parts_of(rig)
 
 
+@pytest.mark.long
 def test_parts_of_a_run_make_its_record(scenario: Scenario, rig: Rig, expected: RunRecord, parts: Parts) -> None:
     """Design: `run --realtime` gives the same result document as lock-step."""
     found = merge(scenario.plan, expected.duration_ns, *parts, [])
@@ -158,6 +159,7 @@ def test_all_frames_of_an_id_that_no_longer_arrive_are_lost(
     assert timing.found > 0
 
 
+@pytest.mark.long
 def test_lost_frames_that_all_say_the_same_are_counted_and_make_nothing_late(scenario: Scenario, parts: Parts) -> None:
     """A joint that stands still sends equal bytes in every cycle: which of them are missing is told by their times."""
     hlc, gateway, joints = parts

@@ -33,6 +33,7 @@ def parts(rig: Rig) -> Parts:
 # --- inside the gateway ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("cob_id", "bus", "way"), [(0x186, 0, "to the controller"), (0x206, 1, "to the drives")])
 def test_frame_that_comes_to_the_gateway_and_does_not_leave_it_is_lost(
     scenario: Scenario, parts: Parts, cob_id: int, bus: int, way: str
@@ -141,6 +142,7 @@ def put_off() -> tuple[Scenario, Parts]:
     return scenario, parts_of(rig)
 
 
+@pytest.mark.long
 def test_frames_behind_those_that_a_fault_put_off_are_not_late(put_off: tuple[Scenario, Parts]) -> None:
     """In order they wait, also after the window; the run is as valid as any."""
     scenario, (hlc, gateway, joints) = put_off

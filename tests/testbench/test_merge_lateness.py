@@ -31,6 +31,7 @@ def parts(rig: Rig) -> Parts:
 # --- what a cycle owes -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("who", ["controller", "joints"])
 def test_answer_or_command_that_was_never_sent_makes_its_cycle_late(scenario: Scenario, parts: Parts, who: str) -> None:
     """Nothing was lost, and nothing that was sent was late: it is just not there."""

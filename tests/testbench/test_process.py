@@ -120,6 +120,7 @@ def test_controller_told_to_end_before_it_began_leaves_at_once(
     assert not read_hlc(part).completed
 
 
+@pytest.mark.long
 def test_controller_without_drives_gives_up_and_says_why(
     scenario: Scenario, channels: list[DeadChannel], tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -132,6 +133,7 @@ def test_controller_without_drives_gives_up_and_says_why(
     assert channels[0].sent[0] == Frame(0x77F, b"\x00")
 
 
+@pytest.mark.long
 def test_frame_that_is_there_before_the_controller_begins_does_not_keep_it_from_beginning(
     scenario: Scenario, channels: list[DeadChannel], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -571,6 +573,7 @@ def test_command_line_has_the_words_and_the_address_of_live_control() -> None:
     assert cli_rig.PARTS == supervisor.PARTS
 
 
+@pytest.mark.long
 def test_gateway_and_hub_need_neither_mujoco_nor_the_controller() -> None:
     """Design: `exo-hil gateway` and `exo-hil hub` work without the extra `sim`."""
     code = (

@@ -77,6 +77,7 @@ def test_loading_it_imports_nothing_heavy(pytester: pytest.Pytester) -> None:
     run_apart(pytester, "--exo-bus=hub").assert_outcomes(passed=1)
 
 
+@pytest.mark.long
 def test_without_mujoco_only_the_test_that_asks_fails(pytester: pytest.Pytester) -> None:
     """The extra `sim` is optional: one line says what to install."""
     pytester.makeconftest("import sys\nsys.modules['mujoco'] = None")  # importing it raises ModuleNotFoundError
@@ -176,6 +177,7 @@ def test_a_duration_without_a_unit_is_refused_with_the_form_that_is_allowed(pyte
     result.stdout.fnmatch_lines(["E*duration 0.1 given, allowed is text with a unit: '0.1 s', '15 cycles'"])
 
 
+@pytest.mark.long
 def test_time_0_that_the_controller_has_said_cannot_be_said_again(pytester: pytest.Pytester) -> None:
     """`exo.gateway.start()` is for foreign controllers."""
     pytester.makepyfile("def test_rig(exo):\n    exo.run_until_motion()\n    exo.gateway.start()")
@@ -300,6 +302,7 @@ def logs(text: list[str]) -> list[Path]:
     return [Path(line) for line in text if line.endswith((f"{Path('/')}controller.log", f"{Path('/')}drive.log"))]
 
 
+@pytest.mark.long
 def test_a_failed_test_shows_the_last_frames_of_both_buses_and_its_logs(pytester: pytest.Pytester) -> None:
     """Issue of every HIL run: what was on the bus. The logs are read here by python-can."""
     pytester.makepyfile(FAILING)
@@ -536,6 +539,7 @@ def test_control_frames_of_the_command_line_reach_the_rig(pytester: pytest.Pytes
     wrong.stdout.fnmatch_lines(["*allowed is controller or drive*"])
 
 
+@pytest.mark.long
 def test_a_rig_that_was_late_is_warned_of_though_its_test_has_passed(pytester: pytest.Pytester) -> None:
     """The limits of the scenario, as a run has them; whoever wants a failure makes an error of the warning."""
     pytester.makeconftest("from testbench.plugin.lockstep import LockStepExo\nLockStepExo.lateness = 'too late'")

@@ -142,6 +142,7 @@ def test_run_without_activations_has_no_lanes(run_maker: RunMaker) -> None:
     assert axes[-1].get_xlabel() == "time from start of motion [s]"
 
 
+@pytest.mark.long
 def test_huge_command_does_not_squeeze_the_torques(failed: Plotted) -> None:
     """The command before the clamp may be thousands of N m; the axis follows the torques that acted."""
     said = failed.faulted.commands

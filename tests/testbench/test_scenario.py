@@ -351,6 +351,7 @@ def test_reading_messages_needs_no_pydantic() -> None:
     assert subprocess.run([sys.executable, "-c", code], check=False, cwd=SCENARIOS.parent).returncode == 0
 
 
+@pytest.mark.long
 @given(
     st.text(st.characters(exclude_categories=["Cs"]), max_size=30),
     st.integers(0, 2**63 - 1),
@@ -390,6 +391,7 @@ KEYS = [
 ]
 
 
+@pytest.mark.long
 @given(st.lists(st.tuples(st.sampled_from(KEYS), VALUES), min_size=1, max_size=2))
 def test_anything_in_a_file_is_a_scenario_or_a_clear_refusal(changes: list[tuple[str, object]]) -> None:
     """No crash and no internal words, whatever stands where."""

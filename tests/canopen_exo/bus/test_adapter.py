@@ -101,6 +101,7 @@ def test_raw_dlc_is_read_and_goes_as_8() -> None:
     assert to_message(Frame(1, bytes(8), 0, 13)).dlc == 8
 
 
+@pytest.mark.long
 @given(
     st.integers(0, 1 << 32),
     st.binary(max_size=70),

@@ -126,6 +126,7 @@ def test_a_run_may_end_with_the_last_crc_bit() -> None:
     assert found > 0
 
 
+@pytest.mark.long
 @settings(max_examples=400)
 @given(can_id=st.integers(0, 0x7FF), data=PAYLOADS)
 def test_base_data_frame_has_the_reference_crc_and_length(can_id: int, data: bytes) -> None:

@@ -188,6 +188,7 @@ def test_overflow_of_the_hubs_transmit_queue_is_counted_lost(start_hub: StartHub
         assert all(told_as_overrun(found))
 
 
+@pytest.mark.long
 def test_frames_missed_are_counted(start_hub: StartHub) -> None:
     """A channel that was not read for long: what is missing is counted in `overruns`, kept + missed = sent."""
     hub = start_hub()

@@ -261,6 +261,7 @@ def test_gap_is_told_once_and_before_the_first_frame_after_it() -> None:
     assert unpack_frame(after, 0) == Frame(4, b"")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", [KIND_FRAME, KIND_FD_FRAME])
 def test_rogue_that_neither_reads_nor_stops_cannot_fill_the_memory(kind: int) -> None:
     """What a client is told about its own frames is bounded too."""

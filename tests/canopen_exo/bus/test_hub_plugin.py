@@ -188,6 +188,7 @@ def test_send_gives_up_at_its_timeout(start_hub: StartHub) -> None:
             bus.send(message(1, bytes(8)), timeout=0)
 
 
+@pytest.mark.long
 def test_frames_missed_show_as_an_error_frame(start_hub: StartHub) -> None:
     """linux/can/error.h: controller, receive buffer overflow; `overruns` has the number."""
     hub = start_hub()

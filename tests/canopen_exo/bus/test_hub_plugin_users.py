@@ -126,6 +126,7 @@ def device_on(address: str, node_id: int) -> Iterator[Device]:
         end.close()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("bitrate", [0, 1_000_000])
 def test_canopen_master_talks_to_a_device_over_the_hub(start_hub: StartHub, bitrate: int) -> None:
     """A CANopen master that was not written here: boot-up, SDO both ways, NMT, heartbeat."""

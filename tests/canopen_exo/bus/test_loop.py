@@ -301,6 +301,7 @@ CROSSING = st.lists(
 )
 
 
+@pytest.mark.long
 @given(sends=CROSSING)
 def test_loop_passes_on_for_a_relay_as_the_relay_itself_would(sends: list[tuple[int, int, int, bytes, int]]) -> None:
     """Relay: the same trace, calls of others and counts, whoever passes a frame on, also at one instant on both."""

@@ -83,6 +83,7 @@ def test_stamp_in_the_future_does_not_wake_the_node_early() -> None:
     assert node.rows == [("frame", 100, 0x10)]
 
 
+@pytest.mark.long
 @given(
     st.lists(
         st.tuples(st.integers(0, 5000), st.integers(0, 1), st.integers(0, 2000)),

@@ -172,6 +172,7 @@ def served(
     return [sent, latencies, node.seen, node.frames, loop.dropped, loop.lateness.document()]
 
 
+@pytest.mark.long
 @given(traffic, traffic, st.sampled_from((0, 1, 5, 1 << 30)))
 def test_records_are_served_as_frames_are(
     first: list[tuple[int, int, Frame | PortState]], second: list[tuple[int, int, Frame | PortState]], takes: int
@@ -180,6 +181,7 @@ def test_records_are_served_as_frames_are(
     assert served(first, second, takes, record=False) == served(first, second, takes, record=True)
 
 
+@pytest.mark.long
 @given(plain_traffic, plain_traffic, st.sampled_from((0, 1, 5, 1 << 30)))
 def test_runs_of_records_are_served_as_frames_are(
     first: list[tuple[int, int, Frame | PortState]], second: list[tuple[int, int, Frame | PortState]], takes: int

@@ -74,6 +74,7 @@ def test_python_can_reads_every_kind_of_frame_back(tmp_path: Path, frame: Frame)
     assert message.channel == "drive"
 
 
+@pytest.mark.long
 @settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
 @given(
     rows=st.lists(

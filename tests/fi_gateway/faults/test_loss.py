@@ -53,6 +53,7 @@ def geometric_pvalue(lengths: list[int], p: float) -> float:
     return float(stats.chisquare([*seen, len(lengths) - sum(seen)], expected).pvalue)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("lost", "given", "wrong"), [(True, 0.25, 0.3), (False, 0.1, 0.12)], ids=["bursts", "gaps"])
 def test_bursts_and_gaps_of_a_gilbert_channel_are_geometric(lost: bool, given: float, wrong: float) -> None:
     """P(bad -> good) = r gives bursts of 1 / r frames, p gaps of 1 / p. Chi-squared at 1 %, seeds 0..19, at most 2."""

@@ -67,6 +67,7 @@ def test_a_law_in_periods_gives_whole_periods() -> None:
     assert {(at - 7) // 1000 for at, _, _ in out.late} >= {0, 1, 2, 3}
 
 
+@pytest.mark.long
 def test_a_drawn_delay_has_the_law_that_was_asked_for() -> None:
     """KS at 1 % over seeds 0..19, at most 2 rejections; another mean is rejected."""
     rejected = [0, 0]

@@ -149,6 +149,7 @@ NOISES: list[tuple[str, type[NoiseFault], float, int, Distribution, Distribution
 """Name, class, amount, value, the law of the error (raw units, so wide that rounding does not show), a wrong one."""
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("make", "amount", "value", "law", "wrong"), [row[1:] for row in NOISES], ids=[row[0] for row in NOISES]
 )

@@ -102,6 +102,7 @@ def fake(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
     return lambda maker: monkeypatch.setattr(made, "__defaults__", (f"{HERE}:{maker}",))
 
 
+@pytest.mark.long
 def test_run_prints_a_table_and_says_where_it_is(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -144,6 +145,7 @@ def test_json_is_one_document(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert status["points"] == document["points"]
 
 
+@pytest.mark.long
 def test_runs_without_a_statement_are_told_and_exit_3(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], fake: Callable[[str], None]
 ) -> None:
@@ -165,6 +167,7 @@ def test_runs_without_a_statement_are_told_and_exit_3(
     assert "crashed" not in capsys.readouterr().out
 
 
+@pytest.mark.long
 def test_result_folder_that_cannot_be_written_ends_the_campaign(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], fake: Callable[[str], None]
 ) -> None:
@@ -208,6 +211,7 @@ def test_retry_makes_invalid_runs_again_where_they_may_come_out_otherwise(
     assert {row.outcome for row in rows_in(store)} == {Outcome.MASKED if realtime else Outcome.INVALID}
 
 
+@pytest.mark.long
 def test_changes_are_another_experiment(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fake: Callable[[str], None]
 ) -> None:
@@ -222,6 +226,7 @@ def test_changes_are_another_experiment(
     assert {row.identity for row in rows_in(plain)}.isdisjoint(row.identity for row in rows_in(changed))
 
 
+@pytest.mark.long
 def test_report_is_written_where_asked(tmp_path: Path, fake: Callable[[str], None]) -> None:
     """Of a store alone: the campaign file and its scenario may be gone."""
     fake("quick")
@@ -234,6 +239,7 @@ def test_report_is_written_where_asked(tmp_path: Path, fake: Callable[[str], Non
     assert junit.read_text(encoding="utf-8").startswith("<?xml")
 
 
+@pytest.mark.long
 def test_export_writes_all_runs(tmp_path: Path, fake: Callable[[str], None]) -> None:
     fake("quick")
     store = str(tmp_path / "s.sqlite")

@@ -207,6 +207,7 @@ def test_worker_that_cannot_make_runs_ends_the_campaign_and_makes_no_row(address
         rows_of(Cluster(address, f"{MAKERS}:not_there"), [replace(spec("golden"), identity="nowhere")])
 
 
+@pytest.mark.long
 def test_no_scheduler_at_the_address_is_said_with_its_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("testbench.campaign.making.cluster.CONNECT_S", 0.5)
     with pytest.raises(ExecutorError, match=r"--cluster tcp://127\.0\.0\.1:9: no scheduler .* 'dask scheduler --host"):

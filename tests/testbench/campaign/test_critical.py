@@ -217,6 +217,7 @@ def test_counts_that_speak_against_one_crossing_are_named() -> None:
 # runs
 
 
+@pytest.mark.long
 def test_runs_have_numbers_of_their_own_within_a_search() -> None:
     """No seed twice in one search, whatever the value: fits take runs as independent. 0, 1, 2, ... without a gap."""
     for method in METHODS:
@@ -237,6 +238,7 @@ def test_the_first_runs_are_a_scan_from_end_to_end() -> None:
     assert len(CriticalPlan(narrow).wanted({})) == 2 * SEARCH.batch
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("method", METHODS)
 def test_a_search_goes_on_where_it_was_and_in_any_order(method: str) -> None:
     """After every number of finished runs a new plan wants the same; rows added backwards change nothing."""
@@ -268,6 +270,7 @@ def test_a_search_that_is_not_finished_says_so() -> None:
     assert plan.results({})[0].answer is Answer.UNFINISHED
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("method", METHODS)
 def test_runs_without_a_statement_are_in_no_share_and_end_the_search_at_its_most(method: str) -> None:
     """All invalid: undecided after `most` runs. One in four: the answer rests on the others, the rest is counted."""

@@ -3,6 +3,7 @@
 import re
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -39,6 +40,7 @@ def test_few_dots_are_all_drawn() -> None:
     assert decimated(DOTS, (400, 300)) == sorted(DOTS)
 
 
+@pytest.mark.long
 def test_many_dots_become_few() -> None:
     """A report stays small whatever the number of runs."""
     dots = [(k * 0.754877 % 1, k * 0.569840 % 1) for k in range(50_000)]

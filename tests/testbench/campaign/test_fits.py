@@ -59,6 +59,7 @@ def test_fit_and_covariance_are_those_of_numpy(offset: float) -> None:
     assert np.array(found.covariance) == pytest.approx(covariance[::-1, ::-1], rel=1e-6)
 
 
+@pytest.mark.long
 def test_known_noise_is_covered() -> None:
     """Independent runs of equal spread: the band at one x holds the curve in 95 % of 2000 campaigns, as does its sd."""
     generator = np.random.default_rng(13)

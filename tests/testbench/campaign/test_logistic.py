@@ -84,6 +84,7 @@ def test_separated_outcomes_leave_the_gap_and_something_beside_it() -> None:
     assert 0.40 < interval.high < 0.5
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("q", [0.1, 0.5, 0.9])
 def test_the_interval_of_the_quantile_covers(q: float) -> None:
     """100 campaigns of nine values, ten runs each: the interval holds the true quantile; half as wide, it does not."""
@@ -129,6 +130,7 @@ def test_rising_shares_pool_what_falls() -> None:
     assert found == pytest.approx((0.1, 0.35, 0.35, 0.9))
 
 
+@pytest.mark.long
 def test_a_fall_is_told_from_chance() -> None:
     """p below 0.05 in at most 14 of 100 level or rising worlds (5 + 4 standard errors); below 0.01 for a hump."""
     generator = np.random.default_rng(34)

@@ -59,6 +59,7 @@ def recipe_of(store: str) -> tuple[str, list[str], int | None]:
     return words[0], [value for key, value in options if key == "--set"], runs
 
 
+@pytest.mark.long
 def test_every_table_is_of_all_runs_that_the_recipe_asks_for() -> None:
     """The document shows what `make paper` makes, whole, or says that it was not run."""
     for store, what, text in blocks():

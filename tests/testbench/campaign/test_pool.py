@@ -53,6 +53,7 @@ def test_run_is_tried_again_when_its_process_dies(tmp_path: Path) -> None:
     assert {row.outcome for row in rows.values()} == {Outcome.MASKED, Outcome.FAILURE_SILENT}
 
 
+@pytest.mark.long
 def test_run_is_crashed_when_its_process_dies_three_times(tmp_path: Path) -> None:
     """Tried again twice at most, then recorded; the runs beside it are made."""
     with pool("dies_for_odd", 2) as executor:
@@ -66,6 +67,7 @@ def test_run_is_crashed_when_its_process_dies_three_times(tmp_path: Path) -> Non
     assert (rows[1].identity, rows[1].seed, rows[1].metrics) == ("1-1", 1, {})
 
 
+@pytest.mark.long
 def test_hung_process_is_killed_and_its_run_recorded(tmp_path: Path) -> None:
     """time_limit: a run that does not end is tried again twice, then counts as hung."""
     with pool("hangs_for_odd") as executor:

@@ -97,6 +97,7 @@ def test_p_values_and_strengths_are_right_where_nothing_matters(kind: str) -> No
     assert np.mean(np.array(strengths, dtype=float)) == pytest.approx(0, abs=0.02)  # 4 standard errors
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("rho", [0.0, 0.5, 0.8])
 def test_the_interval_of_rho_covers(rho: float) -> None:
     """150 campaigns of 40 binormal runs: 90 to 99 %; the true rank correlation is 6 / pi asin(rho / 2)."""

@@ -283,6 +283,7 @@ def test_report_of_600_runs_is_small() -> None:
     assert len(html_text(rows, about).encode()) < 1_000_000
 
 
+@pytest.mark.long
 def test_both_files_are_written_or_left_alone(tmp_path: Path) -> None:
     """Folders are made; a file that cannot be written leaves the old one as it was and nothing half-written."""
     rows, about = parabola()
@@ -297,6 +298,7 @@ def test_both_files_are_written_or_left_alone(tmp_path: Path) -> None:
         write_report(rows, about, blocked / "knee.html", blocked / "knee.xml")
 
 
+@pytest.mark.long
 def test_what_was_changed_from_the_file_is_said_at_the_head() -> None:
     """Published numbers stand beside these; a reader must see that the runs are not those of the file."""
     rows, about = parabola()

@@ -270,6 +270,7 @@ def test_failing_executor_keeps_what_was_made(store: Store) -> None:
     assert len(store.runs.all()) == 2
 
 
+@pytest.mark.long
 def test_full_disk_stops_the_campaign_and_keeps_what_was_made(store: Store) -> None:
     """A clear message, processes stopped, and every run that was counted is there."""
     campaign = small(("runs: 3", "runs: 500"))

@@ -103,6 +103,7 @@ def test_the_bootstrap_is_that_of_scipy_and_of_its_generator() -> None:
     assert (found.low, found.high) == pytest.approx(tuple(np.quantile(means, (0.025, 0.975))), rel=0.03)
 
 
+@pytest.mark.long
 def test_the_bootstrap_covers_what_docs_say() -> None:
     """docs/statistics.md: mean of 30 normal values 92 to 96 %; of a lognormal law with sigma 1 only 82 to 91 %."""
     generator = np.random.default_rng(8)

@@ -235,6 +235,7 @@ def test_an_interval_is_in_order() -> None:
             Interval(low, high, 0.95, "")
 
 
+@pytest.mark.long
 def test_stopping_when_the_interval_is_narrow_costs_little_coverage() -> None:
     """docs/statistics.md: batches of 20, at most 400, width 0.1: exactly summed, mean 95.2 %, at worst 90.5 %."""
     shares, found = np.linspace(0.0025, 0.9975, 200), []

@@ -83,6 +83,7 @@ def test_a_duration_needs_a_unit_and_does_not_go_back(duration: str, error: type
         rig().run_for(duration)
 
 
+@pytest.mark.long
 def test_the_trace_is_that_of_the_same_rig_alone() -> None:
     """The test's node on both buses is silent, and how time is cut into calls changes nothing."""
     exo = rig(rate="500 Hz")
@@ -272,6 +273,7 @@ def test_a_fault_injected_before_the_run_is_there_from_the_first_frame() -> None
     assert HEARTBEAT + 1 not in {row.frame.can_id for row in exo.frames("controller", last=10_000)}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("late", [False, True])
 def test_an_injection_equals_the_same_injector_in_a_file(late: bool) -> None:
     """Same schema, same random stream: trace by trace, whether given before the run or before it was due."""
@@ -344,6 +346,7 @@ def test_nothing_is_said_of_an_injector_before_the_rig_runs() -> None:
 # ---- golden comparison ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_without_a_fault_nothing_deviates() -> None:
     """Same scenario, same trace: exactly 0, in every joint."""
     exo = rig()
@@ -354,6 +357,7 @@ def test_without_a_fault_nothing_deviates() -> None:
         assert exo.deviation(joint).rmse_torque_nm == 0.0
 
 
+@pytest.mark.long
 def test_deviation_is_the_rmse_from_time_zero_to_now() -> None:
     """Against the definition: sqrt(mean((q - q_golden)^2)) over the plant's 1 ms grid, ends included."""
     exo = rig()
@@ -368,6 +372,7 @@ def test_deviation_is_the_rmse_from_time_zero_to_now() -> None:
     assert exo.deviation("right_knee").rmse_position_rad == pytest.approx(expected, rel=1e-12)
 
 
+@pytest.mark.long
 def test_deviation_ends_with_the_motion() -> None:
     """What the drives do after the motion has no golden counterpart."""
     exo = open_lockstep(
