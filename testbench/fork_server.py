@@ -143,11 +143,14 @@ class ForkServer:
 
     @property
     def is_there(self) -> bool:
-        """Whether it runs, is ours, and has been started as it would be now."""
-        if self.owner != os.getpid() or self._switches != _switches():
-            return False
+        """Whether it is ours, has been started as it would be now, and runs."""
+        return self.owner == os.getpid() and self._switches == _switches() and not self.is_gone
+
+    @property
+    def is_gone(self) -> bool:
+        """Whether it has ended."""
         self._listen(0.0)
-        return not self._is_gone
+        return self._is_gone
 
     def fork(self, arguments: list[str], idle: Callable[[], None] | None = None) -> Forked | None:
         """A process of `exo-hil` with these arguments; None: it cannot be had.

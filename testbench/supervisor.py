@@ -131,6 +131,7 @@ class Supervisor:
         self._told: int = 0
         self._known: Final[set[tuple[str, int]]] = set()
         self._is_started: bool = False
+        self._forks: fork_server.ForkServer | None = None
 
     def __enter__(self) -> "Supervisor":
         self._cleaning.enter_context(self._temporary)
@@ -320,20 +321,18 @@ class Supervisor:
 
         It is told who its parent is, and what to remove when that is gone.
         """
-        forks = None if name == "hub" else fork_server.shared()
         given = [name, *arguments, "--folder", self._temporary.name, "--supervisor"]
-        forked = None if forks is None else forks.fork([*given, str(forks.pid)], self._pause)
-        return execute([*given, str(os.getpid())]) if forked is None else forked
+        if name != "hub":
+            self._forks = fork_server.shared()
+            forked = None if self._forks is None else self._forks.fork([*given, str(self._forks.pid)], self._pause)
+            if forked is not None:
+                return forked
+        return execute([*given, str(os.getpid())])
 
     def _pause(self) -> None:
         """One short turn of waiting for something that is not ours to hear."""
         self._check_orders()
-        loop = self._loop
-        if loop is None or not self._channels:
-            time.sleep(_LOOK_NS / SECOND)
-        else:
-            limit = loop.now() + _LOOK_NS
-            loop.run(lambda now: now >= limit)
+        self._idle(None)
 
     def _hear(self, process: Process) -> None:
         if not process.listen() and self._loop is not None:
@@ -414,6 +413,8 @@ class Supervisor:
             process.is_told = True
         self._listen(lambda now: now >= died_at + REACT_NS or all(process.code is not None for process in others))
         text = dead.obituary()
+        if self._forks is not None and self._forks.is_gone:
+            text += "\nthe process that forked joints, gateway and controller was killed, and they end with it"
         told = alarms_text(self.watch.alarms[alarms:])
         if told:
             text += f"\nthe drives then reported: {told}"
@@ -425,12 +426,14 @@ class Supervisor:
             raise RefusedError(text)
         raise ProcessError(text)
 
-    def _idle(self, process: Process) -> None:
-        """One short turn of waiting for a process: everything that is open is served meanwhile."""
+    def _idle(self, process: Process | None) -> None:
+        """One short turn of waiting, for a process or for another reason: everything open is served meanwhile."""
         loop = self._loop
         if loop is not None and self._channels:
             limit = loop.now() + _LOOK_NS
-            loop.run(lambda now: now >= limit or process.code is not None)
+            loop.run(lambda now: now >= limit or (process is not None and process.code is not None))
+        elif process is None:
+            time.sleep(_LOOK_NS / SECOND)
         else:
             process.listen()
             process.wait(_LOOK_NS / SECOND)

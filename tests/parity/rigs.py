@@ -82,7 +82,7 @@ def nothing_left(rig: Supervisor) -> Iterator[Supervisor]:
         finally:
             pids += [process.pid for process in rig.processes.values()]
     assert pids
-    assert not any(is_alive(pid) for pid in pids)
+    assert all(ended(pid, 0.0) for pid in pids)
     assert not folder.exists()  # with its control socket
 
 

@@ -21,10 +21,11 @@ from canopen_exo.bus.node import SECOND
 from canopen_exo.cia402 import DriveState
 from fi_gateway.bus_control import DEFAULT_COMMAND_ID, DEFAULT_STATUS_ID, Command, Status, read_status
 from fi_gateway.bus_control import DONE as DONE_OVER_BUS
-from testbench import supervisor
+from testbench import fork_server, supervisor
 from testbench.child import Process, ProcessError
 from testbench.cli import INVALID, USAGE, main
 from testbench.errors import BenchError
+from testbench.fork_server import ForkServer
 from testbench.process import DONE, ENDED_EARLY, LEAVE_NS
 from testbench.scenario import JOINT_NAMES, Scenario
 from testbench.supervisor import Setup, Supervisor
@@ -145,6 +146,45 @@ def test_process_that_hangs_is_killed_and_named_and_the_others_end_in_order(
         codes = {name: process.code for name, process in rig.processes.items()}
     assert told == ["gateway did not end in 3 s and was killed"]
     assert codes == {"hub": 0, "joints": 0, "gateway": -signal.SIGKILL}
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="processes are forked on Linux alone")
+def test_killed_process_that_forks_ends_the_rig_and_is_named(scenario: Scenario, patience: Patience) -> None:
+    """Those that it has forked hear of it from the kernel; the next rig has another one."""
+
+    def attempt() -> str | Late:
+        with nothing_left(Supervisor(Setup(scenario))) as rig:
+            rig.start()
+            forks = fork_server.shared()
+            assert forks is not None
+            late = walk(rig)
+            if late is not None:
+                return late
+            os.kill(forks.pid, signal.SIGKILL)
+            with pytest.raises(ProcessError) as raised:
+                rig.run(lambda now: False)
+            return str(raised.value)
+
+    said = patience.until_punctual(attempt).splitlines()
+    assert re.match(r"(joints|gateway|hlc) was killed by SIGHUP", said[0])
+    assert "the process that forked joints, gateway and controller was killed, and they end with it" in said
+
+
+@pytest.mark.parametrize("how", ["no server", "no process"])
+def test_processes_are_started_from_nothing_where_they_cannot_be_forked(
+    scenario: Scenario, monkeypatch: pytest.MonkeyPatch, how: str
+) -> None:
+    """On other systems than Linux; without pidfd_open(2), or when there are too many processes."""
+    if how == "no server":
+        monkeypatch.setattr(fork_server, "shared", lambda: None)
+    else:
+        monkeypatch.setattr(ForkServer, "fork", lambda *_: None)
+    with nothing_left(Supervisor(Setup(scenario))) as rig:
+        rig.start()
+        words = [Path(f"/proc/{process.pid}/cmdline").read_bytes().split(b"\0") for process in rig.processes.values()]
+        assert all(b"testbench.cli" in one for one in words)
+        rig.stop()
+        assert {name: process.code for name, process in rig.processes.items()} == dict.fromkeys(rig.processes, 0)
 
 
 # --- not started -----------------------------------------------------------------------------------------------------
