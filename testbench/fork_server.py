@@ -267,7 +267,9 @@ def shared() -> ForkServer | None:
     if sys.platform != "linux":
         return None
     if _SHARED and not _SHARED[0].is_there:
-        _SHARED.pop().close()
+        last = _SHARED.pop()
+        if last.is_gone:
+            last.close()  # else a rig of it may run
     if not _SHARED:
         try:
             server = ForkServer()

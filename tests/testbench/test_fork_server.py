@@ -150,6 +150,8 @@ def test_a_server_that_would_find_other_packages_is_replaced(monkeypatch: pytest
     """Where an interpreter looks for packages is settled as it starts: fault types of users are among them."""
     monkeypatch.setattr(fork_server, "_SHARED", [])
     first = fork_server.shared()
+    assert first is not None
+    process = hub(first)
     (tmp_path / "numpy.py").write_text("raise ImportError('there is no numpy here')\n")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     second = fork_server.shared()
@@ -157,7 +159,10 @@ def test_a_server_that_would_find_other_packages_is_replaced(monkeypatch: pytest
     assert second is not first
     said, code = outcome(forked(second, "check", str(EXAMPLE)))
     assert (code, "there is no numpy here" in said) == (3, True)
-    second.close()
+    assert process.code is None  # of a rig that was there before
+    for server in (first, second):
+        server.close()
+    process.close()
 
 
 def test_signals_to_everybody_are_not_for_the_server(server: ForkServer) -> None:
