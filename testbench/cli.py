@@ -64,7 +64,7 @@ def _parser() -> argparse.ArgumentParser:
         epilog="Exit codes: 0 pass, 1 verdict fail, 2 usage or bad file, 3 run invalid, 130 interrupted.",
     )
     parser.add_argument("--version", action=_Version, nargs=0, help="print the version and leave")
-    verbs = parser.add_subparsers(title="verbs", metavar="VERB", required=True)
+    verbs = parser.add_subparsers(title="verbs", metavar="VERB", required=True, parser_class=VerbParser)
 
     run = verbs.add_parser("run", help="golden run + faulted run, verdict", description=_run.__doc__)
     run.add_argument("scenario", type=Path, nargs="?", metavar="SCENARIO.yaml", help="what to run; see scenarios/")
@@ -98,6 +98,20 @@ def _parser() -> argparse.ArgumentParser:
     export.add_argument("what", choices=("eds", "dbc", "schema"), help="which of them")
     export.set_defaults(verb=_export)
     return parser
+
+
+class VerbParser(argparse.ArgumentParser):
+    """Of a verb: refuses what it does not know itself, so that it is its own usage that is shown."""
+
+    # it has three overloads there, for what `namespace` is; argparse calls it with None for a verb
+    def parse_known_args(  # type: ignore[override]
+        self, args: Sequence[str] | None = None, namespace: None = None
+    ) -> tuple[argparse.Namespace, list[str]]:
+        """See argparse; what it does not know is an error."""
+        found, unknown = super().parse_known_args(args, namespace)
+        if unknown:
+            self.error(f"unrecognized arguments: {' '.join(unknown)}; `{self.prog} --help` lists what there is")
+        return found, unknown
 
 
 class _Version(argparse.Action):

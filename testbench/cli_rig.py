@@ -121,7 +121,7 @@ def add_rig_options(parser: argparse.ArgumentParser) -> None:
         metavar="PART",
         help="leave joints, gateway or hlc to foreign software on the same buses; may be repeated",
     )
-    known = "where others must find it; else any free one"
+    known = "for `up`, and where others must find it; else any free one"
     parser.add_argument("--listen", metavar="HOST:PORT", help=f"of the own hub (default: {HUB_ADDRESS} {known})")
     parser.add_argument("--control", metavar="ADDRESS", help=f"of the gateway (default: {CONTROL_ADDRESS} {known})")
     parser.add_argument("--fifo", action="store_true", help="real-time scheduling (SCHED_FIFO), where permitted")

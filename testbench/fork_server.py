@@ -152,6 +152,14 @@ class ForkServer:
         self._listen(0.0)
         return self._is_gone
 
+    def obituary(self) -> str:
+        """How it ended, in words."""
+        code = self._running.poll()
+        how = "is gone" if code is None else f"ended with exit code {code}"
+        if code is not None and code < 0:
+            how = f"was killed by {signal.Signals(-code).name}"
+        return f"testbench.fork_server (process {self.pid}) {how}, and joints, gateway and controller end with it"
+
     def fork(self, arguments: list[str], idle: Callable[[], None] | None = None) -> Forked | None:
         """A process of `exo-hil` with these arguments; None: it cannot be had.
 
@@ -192,8 +200,9 @@ class ForkServer:
         self._is_gone = True
         self._socket.close()
         if self.owner == os.getpid():
-            self._running.kill()
-            self._running.wait()
+            with contextlib.suppress(KeyboardInterrupt):  # at the end of a program, too
+                self._running.kill()
+                self._running.wait()
 
     def let_go(self) -> None:
         """In a forked copy of the program: the server is that of the original alone, and ends with it."""

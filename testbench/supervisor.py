@@ -323,16 +323,12 @@ class Supervisor:
         """
         given = [name, *arguments, "--folder", self._temporary.name, "--supervisor"]
         if name != "hub":
-            self._forks = fork_server.shared()
-            forked = None if self._forks is None else self._forks.fork([*given, str(self._forks.pid)], self._pause)
+            forks = fork_server.shared()
+            forked = None if forks is None else forks.fork([*given, str(forks.pid)], lambda: self._idle(None))
             if forked is not None:
+                self._forks = forks
                 return forked
         return execute([*given, str(os.getpid())])
-
-    def _pause(self) -> None:
-        """One short turn of waiting for something that is not ours to hear."""
-        self._check_orders()
-        self._idle(None)
 
     def _hear(self, process: Process) -> None:
         if not process.listen() and self._loop is not None:
@@ -393,7 +389,11 @@ class Supervisor:
     def _is_dead(self, process: Process) -> bool:
         """Whether it ended unasked; the controller may when its one motion is over."""
         code = process.code
-        if code is None or process.is_told:
+        if process.is_told:
+            return False
+        if process.name != "hub" and self._forks is not None and self._forks.is_gone:
+            return True  # in a moment
+        if code is None:
             return False
         may_end = process.name == "hlc" and self._is_started and not self.setup.endless
         return not may_end or code not in (DONE, ENDED_EARLY)
@@ -411,10 +411,9 @@ class Supervisor:
         others = [process for process in self.processes.values() if process is not dead]
         for process in others:
             process.is_told = True
-        self._listen(lambda now: now >= died_at + REACT_NS or all(process.code is not None for process in others))
-        text = dead.obituary()
-        if self._forks is not None and self._forks.is_gone:
-            text += "\nthe process that forked joints, gateway and controller was killed, and they end with it"
+        with contextlib.suppress(KeyboardInterrupt):  # who died is told all the same
+            self._listen(lambda now: now >= died_at + REACT_NS or all(process.code is not None for process in others))
+        text = dead.obituary() if self._forks is None or not self._forks.is_gone else self._forks.obituary()
         told = alarms_text(self.watch.alarms[alarms:])
         if told:
             text += f"\nthe drives then reported: {told}"
@@ -427,7 +426,9 @@ class Supervisor:
         raise ProcessError(text)
 
     def _idle(self, process: Process | None) -> None:
-        """One short turn of waiting, for a process or for another reason: everything open is served meanwhile."""
+        """One short turn of waiting for a process, None for one to come: everything open is served meanwhile."""
+        if process is None:
+            self._check_orders()
         loop = self._loop
         if loop is not None and self._channels:
             limit = loop.now() + _LOOK_NS

@@ -44,9 +44,11 @@ class Alarm:
 
 def too_busy(cycle_ns: int) -> str:
     """What to do about a rig that was late, in words."""
+    rate = 1e9 / cycle_ns
+    lower = 100 if rate > 100 else rate / 2
     return (
-        f"this machine is too busy for {1e9 / cycle_ns:g} Hz: end what else runs on it, lower rig.rate (as with --set "
-        "rig.rate=100Hz), or try --fifo"
+        f"this machine is too busy for {rate:g} Hz, where nothing held a process up: end what else runs on it, lower "
+        f"rig.rate (as with --set rig.rate={lower:g}Hz), or try --fifo"
     )
 
 

@@ -214,6 +214,7 @@ class Exo:
         if controller.state is not ControllerState.MOTION:
             said = "; ".join(f"{event.joint or 'rig'}: {event.text}" for event in controller.events)
             reason = self.master.failure or said or f"the controller is {controller.state.name.lower()}"
+            self._check()
             raise AssertionError(f"the motion has not begun until {self.time_s:.3f} s: {reason}")
 
     def expect(self, cob_id: int, *, within: str, data: bytes | str | None = None, bus: str = "drive") -> Transmission:
@@ -280,6 +281,9 @@ class Exo:
 
     def _catch_up(self) -> None:
         """Take in what has come while the test did something else; nothing where time is virtual."""
+
+    def _check(self) -> None:
+        """Raise what a rig raises that is broken: no failure of what is tested; nothing where it cannot be."""
 
     def _advance(self, limit_ns: int, is_over: Callable[[], bool] | None, every_frame: bool = False) -> bool:
         """Run until `is_over()`, asked every 1 ms at least, or after every frame, and give True; False at the limit.

@@ -37,6 +37,9 @@ _GRACE_NS: Final = 100 * MS
 """How long after its limit a call waits for frames from before it, which a busy hub brings late; while a bus is silent
 only, since a later frame of the same bus says that there will be none."""
 
+_BROKEN_NS: Final = 100 * MS
+"""Most that it takes until a process that has ended is found."""
+
 _SENDING_NS: Final = SECOND
 """Most that a frame of the test may wait for its interface."""
 
@@ -185,6 +188,12 @@ class RealTimeExo(Exo):
             if "gateway" not in self._setup.without:
                 self._injectors.connect(rig)
             self._listen()
+
+    def _check(self) -> None:
+        """The processes of a rig that breaks do not end in the same instant."""
+        rig = self._started()
+        limit = rig.now() + _BROKEN_NS
+        rig.run(lambda now: now >= limit)
 
     def _started(self) -> Supervisor:
         self._start()

@@ -292,6 +292,19 @@ def test_a_bit_rate_of_a_hub_without_bit_time_is_refused(capsys: pytest.CaptureF
     assert "add --timed" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("verb", ["up", "campaign run", "fault list"])
+def test_an_option_that_a_verb_does_not_know_shows_what_it_takes(
+    capsys: pytest.CaptureFixture[str], verb: str
+) -> None:
+    """Its own usage, not that of the whole program."""
+    with pytest.raises(SystemExit) as raised:
+        main([*verb.split(), "x", "--rate=100Hz"])
+    said = capsys.readouterr().err
+    assert raised.value.code == 2
+    assert said.startswith(f"usage: exo-hil {verb.split()[0]}")
+    assert f"unrecognized arguments: --rate=100Hz; `exo-hil {verb.split()[0]}" in said
+
+
 def test_options_of_real_time_are_refused_by_the_names_that_were_given(capsys: pytest.CaptureFixture[str]) -> None:
     """And no others."""
     assert main(["run", GOLDEN, "--without", "hlc", "--fifo"]) == 2

@@ -9,8 +9,9 @@ from canopen_exo.bus.channel import Channel
 from canopen_exo.bus.frame import Frame
 from canopen_exo.bus.medium import Transmission
 from canopen_exo.bus.node import MS, NEVER
-from canopen_exo.plan import HEARTBEAT, SYNC
+from canopen_exo.plan import HEARTBEAT, HLC_STATUS, STATUS_STOPPED, SYNC
 from fi_gateway.control import InjectorRow
+from testbench.child import ProcessError
 from testbench.cli_rig import DEFAULT_SCENARIO
 from testbench.errors import BenchError
 from testbench.plugin import realtime
@@ -249,3 +250,22 @@ def test_a_condition_is_asked_about_the_present(rig: Rig, exo: RealTimeExo) -> N
     rig.sleep(100 * MS)
     with pytest.raises(AssertionError, match="did not hold"):
         exo.run_until(lambda: drive.nmt is not None and drive.nmt.value == 127, within="50 ms")
+
+
+def test_a_rig_that_breaks_is_no_failure_of_what_is_tested(
+    rig: Rig, exo: RealTimeExo, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The controller says that it is stopped, as others do before their death is found: that is told instead."""
+    rig.put(100 * MS, HLC_STATUS, bytes((STATUS_STOPPED, 0, 0, 0, 0)), bus=0)
+    with pytest.raises(AssertionError, match="the motion has not begun"):
+        exo.run_until_motion()
+    run = rig.run
+
+    def break_down(until: Callable[[int], bool]) -> None:
+        run(until)
+        if rig.now() > 150 * MS:
+            raise ProcessError("joints was killed by SIGKILL")
+
+    monkeypatch.setattr(rig, "run", break_down)
+    with pytest.raises(ProcessError, match="joints was killed"):
+        exo.run_until_motion()
