@@ -49,6 +49,10 @@ _CHECK_NS: Final = 50 * MS
 _AWAKE_NS: Final = 10 * MS
 """How long a loop that polls busily stays awake after the last thing to read: a cycle of a 100 Hz rig."""
 
+_FLOOD: Final = 32
+"""Frames in one turn that say that they come faster than one by one: many at a time are served with less effort, and a
+loop that polls busily would only serve fewer."""
+
 _RETRY_NS: Final = MS
 """How soon a frame is offered again to an interface that select cannot watch."""
 
@@ -82,8 +86,8 @@ class RealTimeLoop:
     may share one. epoch_ns: time 0 on CLOCK_MONOTONIC. record: keep the trace. measure_latency: keep `latency`.
     gather_ns: sleep so long before looking at what has come, for a node that is in no hurry; not where a channel stamps
     frames when they are read.
-    busy_poll: do not sleep until 10 ms after the last thing to read, which takes a core while frames come: waking up
-    takes a machine longer than passing a frame on. clock, wait: for tests.
+    busy_poll: do not sleep until 10 ms after the last thing to read, unless frames come in floods; takes a core while
+    frames come: waking up takes a machine longer than passing a frame on. clock, wait: for tests.
     trace: every frame in the order served, received ones with their stamp and sender RECEIVED, own ones with the time
     of sending and the node's port. lateness: time served - wake_at of every wake-up. dropped: frames a full transmit
     queue refused, by port.
@@ -206,9 +210,10 @@ class RealTimeLoop:
             now = self._clock() - self.epoch_ns
         readable, writable = self._wait(self._descriptors, writers, max(until - now, 0) / SECOND)
         now = self._clock() - self.epoch_ns
-        if readable and self._busy_poll:
-            self._awake_until = now + _AWAKE_NS
         left = self._drain(now, readable) if self._short_cut is None else self._short_cut.serve(now, readable)
+        if readable and self._busy_poll:
+            came = sum(map(len, left)) if self._short_cut is None else self._short_cut.came
+            self._awake_until = now + _AWAKE_NS if came < _FLOOD else -NEVER
         if left:
             self._serve_arrivals(left, now)
         if node.wake_at <= now:

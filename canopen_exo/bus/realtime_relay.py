@@ -53,6 +53,11 @@ class ShortCut:
         self._at: Final[list[int]] = [0, 0]  # by place: how many of those that came have been served
         self._ends: Final[list[int]] = [0, 0]
 
+    @property
+    def came(self) -> int:
+        """How many frames have come in the last turn."""
+        return self._ends[0] + self._ends[1]
+
     def serve(self, now: int, readable: list[int]) -> list[list[Arrival]]:
         """Read what has come and serve it; what is left, by place."""
         at, ends = self._at, self._ends

@@ -375,6 +375,17 @@ def test_busy_poll_sleeps_only_when_nothing_has_come_for_10_ms() -> None:
     assert len(awake) == 10
 
 
+@pytest.mark.parametrize(("many", "is_awake"), [(31, True), (32, False)])
+def test_busy_poll_sleeps_in_a_flood(many: int, is_awake: bool) -> None:
+    """Frames that wait together are served with less effort than one by one."""
+    world = World(2)
+    world.oversleep = MS
+    for number in range(many):
+        world.arrive(5 * MS, number % 2, Frame(0x181, b""))
+    world.loop(Diary(), [0, 1], busy_poll=True).run(lambda now: now > 12 * MS)
+    assert (0.0 in world.waits) == is_awake
+
+
 def test_readers_that_come_and_go_are_waited_for() -> None:
     """Live control: a reader added while the loop runs is served, one removed is not."""
     world = World()
