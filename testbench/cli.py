@@ -103,8 +103,7 @@ def _parser() -> argparse.ArgumentParser:
 class VerbParser(argparse.ArgumentParser):
     """Of a verb: refuses what it does not know itself, so that it is its own usage that is shown."""
 
-    # it has three overloads there, for what `namespace` is; argparse calls it with None for a verb
-    def parse_known_args(  # type: ignore[override]
+    def parse_known_args(  # type: ignore[override] # argparse has overloads for `namespace`; of a verb it is None
         self, args: Sequence[str] | None = None, namespace: None = None
     ) -> tuple[argparse.Namespace, list[str]]:
         """See argparse; what it does not know is an error."""

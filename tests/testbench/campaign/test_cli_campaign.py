@@ -1,4 +1,7 @@
-"""`exo-hil campaign` seen from outside: what is printed where, exit codes, interruption, death."""
+"""`exo-hil campaign` seen from outside: what is printed where, exit codes, interruption, death.
+
+One module, although long: all its words are tried on the same small campaign.
+"""
 
 import dataclasses
 import json
